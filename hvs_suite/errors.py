@@ -1,0 +1,45 @@
+"""Typed errors: everything a user can do wrong ends in one of these, with one clear line.
+
+The command line prints the line and exits with 2; libraries can catch the class they expect.
+Each class also derives from the built-in that Python users would reach for.
+"""
+
+
+class HvsError(Exception):
+    """Base of every error that the suite raises for bad input; its text says how to mend it."""
+
+
+class UnknownTaskError(HvsError, LookupError):
+    """A task name that is not registered; the text offers the nearest names."""
+
+
+class OptionError(HvsError, ValueError):
+    """An option that does not exist or whose value makes no sense."""
+
+
+class ActionError(HvsError, ValueError):
+    """An action with NaN, infinity, a wrong shape, or values outside [-1, 1]."""
+
+
+class ScenarioError(HvsError, ValueError):
+    """A scenario index or split that does not exist."""
+
+
+class RenderError(HvsError, RuntimeError):
+    """No OpenGL backend can render; ``hvs doctor`` names the missing system package."""
+
+
+class OutputError(HvsError, OSError):
+    """A file or folder that cannot be written, or must not be overwritten."""
+
+
+class DatasetError(HvsError, ValueError):
+    """A dataset that cannot be used for what was asked."""
+
+
+class PolicyError(HvsError, ValueError):
+    """A policy that does not exist, cannot be loaded, or does not fit the task."""
+
+
+class ResultError(HvsError, ValueError):
+    """An evaluation result that is malformed, duplicate or inconsistent."""
