@@ -1,0 +1,287 @@
+"""The KUKA LBR iiwa 7 R800 as a composer entity: chain, inertia, joint control, collision bodies.
+
+One description serves MuJoCo and Pinocchio: :func:`robot_mjcf` is the bare text that both load, and
+:class:`Iiwa7` is the same tree with visual shells. Frames: the base frame stands on the mounting
+plane with z up; at the zero pose every link frame is parallel to it.
+
+Contact bits (two geoms meet if the contype of one shares a bit with the conaffinity of the other;
+adjacent links and the base with link 1 are excluded):
+
+=================  ====================  ==========================
+geom               contype               conaffinity
+=================  ====================  ==========================
+links 1 to 7       ``ROBOT_BIT``         ``ROBOT_BIT | SCENE_BIT``
+base               ``ROBOT_BIT``         ``ROBOT_BIT``
+surfaces, objects  ``SCENE_BIT``         0
+=================  ====================  ==========================
+"""
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from dm_control import composer, mjcf
+
+FloatArray = npt.NDArray[np.float64]
+
+JOINT_NAMES: tuple[str, ...] = ("A1", "A2", "A3", "A4", "A5", "A6", "A7")
+JOINT_RANGE_RAD: FloatArray = np.radians([170.0, 120.0, 170.0, 120.0, 170.0, 120.0, 175.0])
+"""Half the range of each joint, symmetric about zero (rad)."""
+JOINT_SPEED_RAD_S: FloatArray = np.radians([98.0, 98.0, 100.0, 130.0, 140.0, 180.0, 180.0])
+JOINT_TORQUE_NM: FloatArray = np.array([176.0, 176.0, 110.0, 110.0, 110.0, 40.0, 40.0])
+JOINT_ACCELERATION_RAD_S2: FloatArray = np.array([8.65, 5.44, 5.69, 11.01, 11.78, 13.76, 13.17])
+"""Estimates published by others; KUKA gives none."""
+JOINT_AXES: tuple[tuple[int, int, int], ...] = (
+    (0, 0, 1),
+    (0, 1, 0),
+    (0, 0, 1),
+    (0, -1, 0),
+    (0, 0, 1),
+    (0, 1, 0),
+    (0, 0, 1),
+)
+
+BASE_TO_SHOULDER_M = 0.340
+SHOULDER_TO_ELBOW_M = 0.400
+ELBOW_TO_WRIST_M = 0.400
+WRIST_TO_FLANGE_M = 0.126
+FLANGE_RADIUS_M = 0.0315
+"""ISO 9409-1-50-7-M6: outer diameter 63 mm."""
+
+JOINT_HEIGHTS_M: tuple[float, ...] = (0.150, 0.340, 0.550, 0.740, 0.950, 1.140, 1.221)
+"""Height of each link frame above the base at the zero pose; A2, A4, A6 are pivot centres."""
+FLANGE_HEIGHT_M = BASE_TO_SHOULDER_M + SHOULDER_TO_ELBOW_M + ELBOW_TO_WRIST_M + WRIST_TO_FLANGE_M
+
+PHYSICS_TIMESTEP_S = 1.0 / 240.0
+"""The timestep that the gains below are tuned for, with integrator ``implicitfast``."""
+ARMATURE_KG_M2 = 0.1
+"""Rotor inertia seen through the gears; KUKA gives none."""
+STIFFNESS_NM_RAD: FloatArray = np.array([10e3, 10e3, 10e3, 10e3, 10e3, 10e3, 10e3])
+DAMPING_NM_S_RAD: FloatArray = np.array([400.0, 400.0, 400.0, 400.0, 400.0, 400.0, 400.0])
+
+ROBOT_BIT = 1
+SCENE_BIT = 2
+SHELL_GROUP = 2
+"""Visual geoms, shown by default, never in contact."""
+COLLISION_GROUP = 3
+"""Collision geoms, hidden by default."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Capsule:
+    """A collision capsule between two points of the link frame (m)."""
+
+    start: tuple[float, float, float]
+    end: tuple[float, float, float]
+    radius: float
+
+
+@dataclasses.dataclass(frozen=True)
+class _Link:
+    """Mass (kg), centre of mass (m, link frame) and inertia about it (kg m^2), collision geoms."""
+
+    mass: float
+    centre: tuple[float, float, float]
+    inertia: tuple[float, float, float]
+    capsules: tuple[_Capsule, ...]
+
+
+_LINKS: tuple[_Link, ...] = (
+    _Link(
+        4.856, (-0.01, 0, 0.06), (0.02, 0.02, 0.02), (_Capsule((0, 0, 0.07), (0, 0, 0.08), 0.07),)
+    ),
+    _Link(
+        3.394,
+        (0, -0.02, 0.12),
+        (0.017, 0.016, 0.009),
+        (
+            _Capsule((0, 0, 0.06), (0, 0, 0.13), 0.065),
+            _Capsule((0, -0.04, 0.19), (0, 0.0, 0.19), 0.07),
+        ),
+    ),
+    _Link(
+        4.032,
+        (0, 0.03, 0.06),
+        (0.024, 0.022, 0.012),
+        (_Capsule((0, 0.04, 0.0), (0, 0, 0.0), 0.07), _Capsule((0, 0, 0.05), (0, 0, 0.15), 0.065)),
+    ),
+    _Link(
+        3.394,
+        (0, 0.02, 0.12),
+        (0.017, 0.016, 0.009),
+        (
+            _Capsule((0, 0, 0.06), (0, 0, 0.13), 0.065),
+            _Capsule((0, 0.04, 0.19), (0, 0.0, 0.19), 0.07),
+        ),
+    ),
+    _Link(
+        4.032,
+        (0, -0.03, 0.06),
+        (0.024, 0.022, 0.012),
+        (_Capsule((0, -0.04, 0.0), (0, 0, 0.0), 0.07), _Capsule((0, 0, 0.05), (0, 0, 0.15), 0.065)),
+    ),
+    _Link(
+        1.529,
+        (0, -0.02, 0.08),
+        (0.009, 0.008, 0.004),
+        (
+            _Capsule((0, 0, 0.06), (0, -0.02, 0.1), 0.06),
+            _Capsule((0, -0.05, 0.12), (0, -0.05, 0.19), 0.04),
+        ),
+    ),
+    _Link(
+        2.404,
+        (0, 0.01, 0.01),
+        (0.005, 0.004, 0.004),
+        (_Capsule((0, -0.02, 0), (0, 0.05, 0), 0.055),),
+    ),
+    _Link(0.259, (0, 0, 0.025), (2e-4, 2e-4, 3e-4), ()),
+)
+"""The base and links 1 to 7."""
+
+
+def _add_capsules(body: Any, name: str, capsules: tuple[_Capsule, ...], conaffinity: int) -> None:
+    """Adds the collision capsules of one link to its body."""
+    for i, capsule in enumerate(capsules):
+        body.add(
+            "geom",
+            name=f"{name}_collision_{i}",
+            type="capsule",
+            fromto=(*capsule.start, *capsule.end),
+            size=[capsule.radius],
+            dclass="collision",
+            conaffinity=conaffinity,
+        )
+
+
+def _add_inertial(body: Any, link: _Link) -> None:
+    body.add("inertial", mass=link.mass, pos=link.centre, diaginertia=link.inertia)
+
+
+def _robot_tree() -> mjcf.RootElement:
+    """Builds the bare robot: bodies, joints, actuators, collision geoms and the flange site."""
+    root = mjcf.RootElement(model="iiwa7")
+    root.compiler.angle = "radian"
+    root.compiler.autolimits = True
+    root.option.timestep = PHYSICS_TIMESTEP_S
+    root.option.integrator = "implicitfast"
+    collision = root.default.add("default", dclass="collision").geom
+    collision.contype = ROBOT_BIT
+    collision.conaffinity = ROBOT_BIT | SCENE_BIT
+    collision.group = COLLISION_GROUP
+    collision.mass = 0
+    collision.rgba = (0.8, 0.2, 0.2, 0.5)
+
+    body = root.worldbody.add("body", name="base")
+    _add_inertial(body, _LINKS[0])
+    _add_capsules(body, "base", _LINKS[0].capsules, conaffinity=ROBOT_BIT)
+    height = 0.0
+    for i, joint_name in enumerate(JOINT_NAMES):
+        name = f"link_{i + 1}"
+        link = _LINKS[i + 1]
+        body = body.add(
+            "body", name=name, pos=(0, 0, round(JOINT_HEIGHTS_M[i] - height, 6)), gravcomp=1
+        )
+        height = JOINT_HEIGHTS_M[i]
+        _add_inertial(body, link)
+        torque = JOINT_TORQUE_NM[i]
+        body.add(
+            "joint",
+            name=joint_name,
+            type="hinge",
+            axis=JOINT_AXES[i],
+            range=(-JOINT_RANGE_RAD[i], JOINT_RANGE_RAD[i]),
+            armature=ARMATURE_KG_M2,
+            actuatorgravcomp=True,
+            actuatorfrcrange=(-torque, torque),
+        )
+        _add_capsules(body, name, link.capsules, conaffinity=ROBOT_BIT | SCENE_BIT)
+        root.actuator.add(
+            "intvelocity",
+            name=joint_name,
+            joint=joint_name,
+            kp=STIFFNESS_NM_RAD[i],
+            kv=DAMPING_NM_S_RAD[i],
+            ctrlrange=(-JOINT_SPEED_RAD_S[i], JOINT_SPEED_RAD_S[i]),
+            actrange=(-JOINT_RANGE_RAD[i], JOINT_RANGE_RAD[i]),
+        )
+        # MuJoCo filters parent and child only where the parent can move.
+        root.contact.add("exclude", body1="base" if i == 0 else f"link_{i}", body2=name)
+    body.add(
+        "geom",
+        name="flange_collision",
+        type="cylinder",
+        fromto=(0, 0, 0.0, 0, 0, FLANGE_HEIGHT_M - height),
+        size=[FLANGE_RADIUS_M],
+        dclass="collision",
+    )
+    body.add("site", name="flange", pos=(0, 0, round(FLANGE_HEIGHT_M - height, 6)), group=4)
+    return root
+
+
+def robot_mjcf() -> str:
+    """The bare robot (no shells, no assets) as MJCF text that MuJoCo and Pinocchio both load."""
+    return str(_robot_tree().to_xml_string())
+
+
+class Iiwa7(composer.Entity):
+    """The arm as a composer entity; its model origin is the base frame.
+
+    After attaching, set ``physics.bind(robot.actuators).act`` to the joint positions at every
+    reset: MuJoCo's default of 0 would throw the arm.
+    """
+
+    def _build(self, shells: bool = True) -> None:
+        """Builds the model.
+
+        Args:
+            shells: Add the visual shells; without them only collision geoms (hidden) exist.
+        """
+        self._root = _robot_tree()
+        self._shell_geoms: tuple[Any, ...] = ()
+        if shells:
+            from hvs_suite.cell import shells as shells_module
+
+            self._shell_geoms = shells_module.add_shells(self._root)
+
+    @property
+    def mjcf_model(self) -> mjcf.RootElement:
+        """Root of the robot's MJCF tree."""
+        return self._root
+
+    @property
+    def joints(self) -> tuple[Any, ...]:
+        """The joints A1 to A7."""
+        return tuple(self._root.find("joint", name) for name in JOINT_NAMES)
+
+    @property
+    def actuators(self) -> tuple[Any, ...]:
+        """The ``intvelocity`` actuators A1 to A7: control is a set-point speed (rad/s)."""
+        return tuple(self._root.find("actuator", name) for name in JOINT_NAMES)
+
+    @property
+    def flange(self) -> Any:
+        """Site at the flange face centre, +z out along the tool axis."""
+        return self._root.find("site", "flange")
+
+    @property
+    def flange_body(self) -> Any:
+        """Link 7, which carries the flange."""
+        return self._root.find("body", "link_7")
+
+    @property
+    def base_body(self) -> Any:
+        """The base link, standing on the mounting plane."""
+        return self._root.find("body", "base")
+
+    @property
+    def collision_geoms(self) -> tuple[Any, ...]:
+        """All collision geoms, base included."""
+        return tuple(g for g in self._root.find_all("geom") if str(g.name).find("collision") >= 0)
+
+    @property
+    def shell_geoms(self) -> tuple[Any, ...]:
+        """The visual geoms; empty without shells."""
+        return self._shell_geoms
