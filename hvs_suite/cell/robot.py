@@ -17,7 +17,6 @@ surfaces, objects  ``SCENE_BIT``         0
 """
 
 import dataclasses
-import math
 from typing import Any
 
 import numpy as np

@@ -1,0 +1,338 @@
+"""Kinematics and dynamics of the iiwa: Pinocchio on the cell's own MJCF, closed-form inverse.
+
+All poses are in the robot's base frame (m, rad). The flange frame is the site ``flange``: origin
+at the flange face centre, +z out along the tool axis.
+"""
+
+import functools
+import pathlib
+import tempfile
+
+import coal
+import numpy as np
+import numpy.typing as npt
+import pinocchio as pin
+
+from hvs_suite.cell import robot
+
+FloatArray = npt.NDArray[np.float64]
+
+_SHOULDER = np.array([0.0, 0.0, robot.BASE_TO_SHOULDER_M])
+_SINGULAR = 1e-9
+"""Below this sine of A2 or A6 the two axes beside it coincide."""
+# A shape and its mirror image through each of the three pivots: adding pi to the two roll joints
+# beside a pivot and negating the pivot leaves the pose of everything else alone.
+_FLIP_SHOULDER = np.array([1, 0, 1, 0, 0, 0, 0], dtype=np.float64)
+_FLIP_ELBOW = np.array([0, 0, 1, 0, 1, 0, 0], dtype=np.float64)
+_FLIP_WRIST = np.array([0, 0, 0, 0, 1, 0, 1], dtype=np.float64)
+
+
+def _branches() -> tuple[FloatArray, FloatArray]:
+    """Shift (8, 7) in rad and sign (8, 7) that turn one shape into its eight mirror shapes."""
+    shifts, signs = [], []
+    for shoulder in (0, 1):
+        for elbow in (0, 1):
+            for wrist in (0, 1):
+                flips = shoulder * _FLIP_SHOULDER + elbow * _FLIP_ELBOW + wrist * _FLIP_WRIST
+                shifts.append(np.pi * flips)
+                signs.append([1, 1 - 2 * shoulder, 1, 1 - 2 * elbow, 1, 1 - 2 * wrist, 1])
+    return np.array(shifts), np.array(signs, dtype=np.float64)
+
+
+_BRANCH_SHIFT, _BRANCH_SIGN = _branches()
+
+
+def _wrap(angle: FloatArray) -> FloatArray:
+    """The same angles within [-pi, pi) rad."""
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def _zyz_angles(R: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Angles a, b >= 0, c (n,) with R (n, 3, 3) = Rz(a) Ry(b) Rz(c); a = 0 where b is 0 or pi."""
+    sin_b = np.hypot(R[:, 0, 2], R[:, 1, 2])
+    a = np.where(sin_b < _SINGULAR, 0.0, np.arctan2(R[:, 1, 2], R[:, 0, 2]))
+    b = np.arctan2(sin_b, R[:, 2, 2])
+    # c from what Rz(a) leaves, so that a + c is right in the singular shape too.
+    cos_a, sin_a = np.cos(a), np.sin(a)
+    c = np.arctan2(cos_a * R[:, 1, 0] - sin_a * R[:, 0, 0], cos_a * R[:, 1, 1] - sin_a * R[:, 0, 1])
+    return a, b, c
+
+
+def _perpendicular(direction: FloatArray) -> FloatArray:
+    """A unit vector (3,) at right angles to a unit vector (3,): the upward one where there is."""
+    reference = np.array([0.0, 0.0, 1.0]) if abs(direction[2]) < 0.999 else np.array([1.0, 0, 0])
+    across = reference - direction * (reference @ direction)
+    return np.asarray(across / np.linalg.norm(across))
+
+
+def tool_frame(normal: npt.ArrayLike) -> FloatArray:
+    """The flange orientation of yaw 0 that faces a surface.
+
+    Args:
+        normal: Outward surface normal (3,), base frame; need not have unit length.
+
+    Returns:
+        Rotation (3, 3) whose z axis is -normal and whose x axis points as much along the base
+        frame's +x as it can (along +y where the normal is parallel to x). Yaw turns about z.
+    """
+    z = -np.asarray(normal, dtype=np.float64)
+    z = z / np.linalg.norm(z)
+    reference = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.999 else np.array([0.0, 1.0, 0.0])
+    x = reference - z * (reference @ z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def travel_time(
+    q_from: npt.ArrayLike, q_to: npt.ArrayLike, acceleration_limits: bool
+) -> FloatArray:
+    """Least time from rest to rest, the slowest joint deciding: a lower bound for any motion.
+
+    Per joint over the distance d: d / v with speed limits alone; with acceleration limits
+    d / v + v / a where top speed is reached (d >= v^2 / a), else 2 sqrt(d / a).
+
+    Args:
+        q_from: Start (7,) in rad.
+        q_to: Ends (m, 7) in rad.
+        acceleration_limits: Respect ``JOINT_ACCELERATION_RAD_S2`` too, not just the speeds.
+
+    Returns:
+        Times (m,) in s.
+    """
+    distance = np.abs(np.asarray(q_to, dtype=np.float64) - np.asarray(q_from, dtype=np.float64))
+    v, a = robot.JOINT_SPEED_RAD_S, robot.JOINT_ACCELERATION_RAD_S2
+    if not acceleration_limits:
+        return np.asarray((distance / v).max(axis=-1))
+    trapezoid = distance / v + v / a
+    triangle = 2.0 * np.sqrt(distance / a)
+    return np.asarray(np.where(distance >= v**2 / a, trapezoid, triangle).max(axis=-1))
+
+
+class Kinematics:
+    """Pinocchio's view of the cell's robot; configurations are (7,) in rad, A1 to A7.
+
+    Not for use by several threads at once: Pinocchio's buffers are shared between calls.
+    """
+
+    def __init__(self) -> None:
+        # Pinocchio reads MJCF from a file only.
+        with tempfile.TemporaryDirectory() as folder:
+            path = pathlib.Path(folder, "iiwa7.xml")
+            path.write_text(robot.robot_mjcf(), encoding="utf-8")
+            self.model = pin.buildModelFromMJCF(str(path))
+            self.geometry = pin.buildGeomFromMJCF(self.model, str(path), pin.GeometryType.COLLISION)
+        if self.model.nq != len(robot.JOINT_NAMES):
+            raise RuntimeError("Pinocchio read no robot from the cell's MJCF")
+        self._flange = self.model.getFrameId("flange")
+        self._data = self.model.createData()
+        self._add_collision_pairs()
+        self._geometry_data = self.geometry.createData()
+
+    def _add_collision_pairs(self) -> None:
+        """Pairs up all geoms except within a link and between adjacent links."""
+        objects = self.geometry.geometryObjects
+        for i, first in enumerate(objects):
+            for j in range(i + 1, len(objects)):
+                if abs(first.parentJoint - objects[j].parentJoint) > 1:
+                    self.geometry.addCollisionPair(pin.CollisionPair(i, j))
+        # Base and link 1 can never come closer to the surface than they stand.
+        self._movable = [i for i, g in enumerate(objects) if g.parentJoint >= 2]
+        shapes = [objects[i].geometry for i in self._movable]
+        self._radius = np.array([shape.radius for shape in shapes])
+        self._half_length = np.array([shape.halfLength for shape in shapes])
+        self._is_cylinder = np.array([isinstance(shape, coal.Cylinder) for shape in shapes])
+
+    def flange_pose(self, q: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Rotation (3, 3) and position (3,) in m of the flange in the base frame."""
+        pin.forwardKinematics(self.model, self._data, np.asarray(q, dtype=np.float64))
+        placement = pin.updateFramePlacement(self.model, self._data, self._flange)
+        return placement.rotation.copy(), placement.translation.copy()
+
+    def jacobian(self, q: npt.ArrayLike) -> FloatArray:
+        """Jacobian (6, 7) of the flange: linear (m/rad) over angular rows, in base axes."""
+        return np.asarray(
+            pin.computeFrameJacobian(
+                self.model,
+                self._data,
+                np.asarray(q, dtype=np.float64),
+                self._flange,
+                pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
+            ).copy()
+        )
+
+    def mass_matrix(self, q: npt.ArrayLike) -> FloatArray:
+        """Joint-space mass matrix (7, 7) in kg m^2, rotor inertia included."""
+        M = pin.crba(self.model, self._data, np.asarray(q, dtype=np.float64))
+        return np.triu(M) + np.triu(M, 1).T
+
+    def gravity_torques(self, q: npt.ArrayLike) -> FloatArray:
+        """Torques (7,) in Nm that hold the arm still against gravity."""
+        return np.asarray(
+            pin.computeGeneralizedGravity(
+                self.model, self._data, np.asarray(q, dtype=np.float64)
+            ).copy()
+        )
+
+    def clearance(self, q: npt.ArrayLike, surface_height_m: float = 0.0) -> float:
+        """Least distance (m) from links 2 to 7 to a level surface, and between distant links.
+
+        Uses the same collision geoms as MuJoCo; adjacent links are not compared. Negative where
+        bodies interpenetrate.
+
+        Args:
+            q: Configuration (7,) in rad.
+            surface_height_m: Height of the surface in the base frame (m).
+        """
+        q = np.asarray(q, dtype=np.float64)
+        pin.updateGeometryPlacements(self.model, self._data, self.geometry, self._geometry_data, q)
+        placements = self._geometry_data.oMg
+        height = np.array([placements[i].translation[2] for i in self._movable])
+        axis_z = np.array([placements[i].rotation[2, 2] for i in self._movable])
+        # A capsule's end is a ball; a cylinder's a disc, whose rim dips by r sin(tilt).
+        dip = np.where(self._is_cylinder, np.sqrt(np.maximum(0.0, 1.0 - axis_z**2)), 1.0)
+        lowest = height - self._half_length * np.abs(axis_z) - self._radius * dip
+        pin.computeDistances(self.geometry, self._geometry_data)
+        between = min(result.min_distance for result in self._geometry_data.distanceResults)
+        return float(min(between, lowest.min() - surface_height_m))
+
+    def inverse_kinematics(
+        self,
+        position: npt.ArrayLike,
+        normal: npt.ArrayLike,
+        yaw: npt.ArrayLike,
+        swivel: npt.ArrayLike,
+    ) -> FloatArray:
+        """All configurations within the joint ranges that hold the flange at a pose.
+
+        Closed form for the spherical shoulder, revolute elbow, spherical wrist: A4 follows from
+        the distance of wrist and shoulder, the swivel picks the elbow on its circle about the
+        line between them, and the roll-pitch-roll triples A1-A3 and A5-A7 are Euler angles. Each
+        elbow place has eight shapes (mirrored at shoulder, elbow and wrist). All roll joints
+        turn by less than a full circle, so no angle has a second value within its range.
+
+        Args:
+            position: Flange face centre (3,) in m.
+            normal: Outward surface normal (3,); the flange's +z is its opposite.
+            yaw: Turn about the flange's +z from :func:`tool_frame` (n,) in rad, paired with
+                ``swivel``.
+            swivel: Angle of the elbow on its circle (n,) in rad, 0 at the highest point.
+
+        Returns:
+            Configurations (m, 7) in rad, m <= 8 n; none where the wrist is out of reach.
+        """
+        yaw, swivel = np.broadcast_arrays(
+            np.atleast_1d(np.asarray(yaw, dtype=np.float64)),
+            np.atleast_1d(np.asarray(swivel, dtype=np.float64)),
+        )
+        q = self._shapes(position, normal, swivel)
+        if len(q):
+            q[:, 6] += np.tile(yaw, len(_BRANCH_SIGN))
+        return _within_ranges(q)
+
+    def goal_configurations(
+        self,
+        position: npt.ArrayLike,
+        normal: npt.ArrayLike,
+        n_yaw: int = 24,
+        n_swivel: int = 24,
+    ) -> FloatArray:
+        """The redundant family of a goal: every yaw with every elbow place, in all shapes.
+
+        Yaw turns A7 alone. Who only wants the fastest way takes
+        :meth:`goal_configurations_at_tool_angle`, which needs no grid of yaws.
+
+        Args:
+            position: Flange face centre (3,) in m.
+            normal: Outward surface normal (3,).
+            n_yaw: Evenly spaced yaws over the circle.
+            n_swivel: Evenly spaced elbow places over the circle.
+
+        Returns:
+            Configurations (m, 7) in rad within the joint ranges, m <= 8 n_yaw n_swivel.
+        """
+        shapes = self._shapes(position, normal, _circle(n_swivel))
+        shapes = shapes[(np.abs(shapes[:, :6]) <= robot.JOINT_RANGE_RAD[:6]).all(axis=1)]
+        q = np.repeat(shapes, n_yaw, axis=0)
+        q[:, 6] = _wrap(q[:, 6] + np.tile(_circle(n_yaw), len(shapes)))
+        return q[np.abs(q[:, 6]) <= robot.JOINT_RANGE_RAD[6]]
+
+    def goal_configurations_at_tool_angle(
+        self,
+        position: npt.ArrayLike,
+        normal: npt.ArrayLike,
+        tool_angle: float,
+        n_swivel: int = 72,
+    ) -> FloatArray:
+        """The family of a goal with A7 at a given angle: yaw is free, so A7 need not move at all.
+
+        With ``tool_angle`` where A7 is now, this holds the fastest configurations of all yaws.
+
+        Args:
+            position: Flange face centre (3,) in m.
+            normal: Outward surface normal (3,).
+            tool_angle: Angle of A7 (rad) within its range.
+            n_swivel: Evenly spaced elbow places over the circle.
+
+        Returns:
+            Configurations (m, 7) in rad within the joint ranges, m <= 8 n_swivel.
+        """
+        q = self._shapes(position, normal, _circle(n_swivel))
+        q[:, 6] = tool_angle
+        return _within_ranges(q)
+
+    def _shapes(
+        self, position: npt.ArrayLike, normal: npt.ArrayLike, swivel: FloatArray
+    ) -> FloatArray:
+        """The eight shapes of each elbow place at yaw 0: (8 n, 7) in rad, ranges not checked.
+
+        Shape by shape, each for all swivels in order; empty where out of reach.
+        """
+        R_goal = tool_frame(normal)
+        wrist = np.asarray(position, dtype=np.float64) - robot.WRIST_TO_FLANGE_M * R_goal[:, 2]
+        line = wrist - _SHOULDER
+        reach = float(np.linalg.norm(line))
+        upper, fore = robot.SHOULDER_TO_ELBOW_M, robot.ELBOW_TO_WRIST_M
+        cos_elbow = (reach**2 - upper**2 - fore**2) / (2.0 * upper * fore)
+        if abs(cos_elbow) > 1.0 + 1e-12 or reach == 0.0:
+            return np.empty((0, 7))
+        elbow = float(np.arccos(np.clip(cos_elbow, -1.0, 1.0)))
+        sin_4, cos_4 = np.sin(elbow), np.cos(elbow)
+
+        # Frame of the line shoulder-wrist after A3 (elbow on its +x side), and the same in base.
+        along = np.array([-fore * sin_4, 0.0, upper + fore * cos_4]) / reach
+        frame_arm = np.stack([[along[2], 0.0, -along[0]], [0.0, 1.0, 0.0], along], axis=1)
+        axis = line / reach
+        up = _perpendicular(axis)
+        side = np.cross(axis, up)
+        cos_s, sin_s = np.cos(swivel)[:, None], np.sin(swivel)[:, None]
+        frame_base = np.empty((len(swivel), 3, 3))
+        frame_base[:, :, 0] = cos_s * up + sin_s * side
+        frame_base[:, :, 1] = cos_s * side - sin_s * up
+        frame_base[:, :, 2] = axis
+        R_shoulder = frame_base @ frame_arm.T
+        R_elbow = np.array([[cos_4, 0.0, -sin_4], [0.0, 1.0, 0.0], [sin_4, 0.0, cos_4]])
+        R_wrist = (R_shoulder @ R_elbow).transpose(0, 2, 1) @ R_goal
+
+        q = np.empty((len(swivel), 7))
+        q[:, 0], q[:, 1], q[:, 2] = _zyz_angles(R_shoulder)
+        q[:, 3] = elbow
+        q[:, 4], q[:, 5], q[:, 6] = _zyz_angles(R_wrist)
+        shapes = _BRANCH_SIGN[:, None, :] * q + _BRANCH_SHIFT[:, None, :]
+        return _wrap(shapes.reshape(-1, 7))
+
+
+def _circle(n: int) -> FloatArray:
+    """Angles (n,) in rad, evenly spaced over the full circle from 0."""
+    return np.arange(n) * (2.0 * np.pi / n)
+
+
+def _within_ranges(q: FloatArray) -> FloatArray:
+    """The rows of q (n, 7), wrapped to [-pi, pi), that lie within the joint ranges."""
+    q = _wrap(q)
+    return q[(np.abs(q) <= robot.JOINT_RANGE_RAD).all(axis=1)]
+
+
+@functools.cache
+def kinematics() -> Kinematics:
+    """The process's one :class:`Kinematics`, built at first use."""
+    return Kinematics()
