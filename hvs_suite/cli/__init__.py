@@ -1,0 +1,1 @@
+"""The ``hvs`` command: one file a subcommand, each a typed dataclass with ``run()``."""

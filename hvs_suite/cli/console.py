@@ -1,0 +1,94 @@
+"""What every command says the same way: tables, progress and JSON.
+
+Rich draws where a person looks on; a pipe or a log file gets plain lines.
+"""
+
+import contextlib
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+PLAIN_WIDTH = 120
+PLAIN_PROGRESS_PERIOD_S = 10.0
+
+
+def console() -> "Console":
+    """The console on stdout; at least 120 columns wide where stdout is no terminal."""
+    from rich.console import Console
+
+    return Console(highlight=False, width=None if sys.stdout.isatty() else PLAIN_WIDTH)
+
+
+def print_json(content: Mapping[str, Any] | Sequence[Any]) -> None:
+    """Print one JSON document, indented, to stdout."""
+    print(json.dumps(content, indent=2))
+
+
+def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], title: str = "") -> None:
+    """Print a table; a first column of names, then right-aligned figures.
+
+    Args:
+        columns: Headings.
+        rows: Cells as text, one sequence a row.
+        title: Line above the table.
+    """
+    from rich import box
+    from rich.table import Table
+
+    table = Table(title=title or None, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    for index, column in enumerate(columns):
+        table.add_column(column, justify="left" if index == 0 else "right")
+    for row in rows:
+        table.add_row(*row)
+    console().print(table)
+
+
+@contextlib.contextmanager
+def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
+    """Show how far long work has come, with its rate and the time left.
+
+    Args:
+        what: The work, in a few words.
+        total: Units of work.
+
+    Yields:
+        A function to call after each unit.
+    """
+    if sys.stderr.isatty():
+        from rich import progress as rich_progress
+        from rich.console import Console
+
+        bar = rich_progress.Progress(
+            rich_progress.TextColumn("{task.description}"),
+            rich_progress.BarColumn(),
+            rich_progress.MofNCompleteColumn(),
+            rich_progress.TimeRemainingColumn(),
+            console=Console(stderr=True),
+        )
+        with bar:
+            task = bar.add_task(what, total=total)
+            yield lambda: bar.advance(task)
+        return
+    yield _plain_progress(what, total)
+
+
+def _plain_progress(what: str, total: int) -> Callable[[], None]:
+    """A function that counts, and prints a line every ten seconds and at the end."""
+    started = last = time.monotonic()
+    done = 0
+
+    def advance() -> None:
+        nonlocal done, last
+        done += 1
+        now = time.monotonic()
+        if done == total or now - last >= PLAIN_PROGRESS_PERIOD_S:
+            last = now
+            left = (now - started) / done * (total - done)
+            print(f"{what}: {done}/{total}, {left:.0f} s left", file=sys.stderr, flush=True)
+
+    return advance

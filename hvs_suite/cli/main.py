@@ -1,0 +1,125 @@
+"""Entry point of ``hvs``: reads the command line, runs one command, turns errors into one line.
+
+Exit codes: 0 on success, 1 where a check found something wrong, 2 for a user's mistake (one line on
+stderr that says how to mend it), 130 when interrupted. Only defects of ours show a traceback.
+"""
+
+import contextlib
+import importlib
+import io
+import os
+import re
+import sys
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from hvs_suite.errors import HvsError
+
+# Name -> where its dataclass lives. Those modules import nothing heavy at the top, so that
+# `hvs --help` answers at once.
+COMMANDS = {
+    "tasks": "hvs_suite.cli.tasks:Tasks",
+    "show": "hvs_suite.cli.show:Show",
+    "view": "hvs_suite.cli.view:View",
+    "record": "hvs_suite.cli.record:Record",
+    "pretrain": "hvs_suite.cli.pretrain:Pretrain",
+    "evaluate": "hvs_suite.cli.evaluate:Evaluate",
+    "leaderboard": "hvs_suite.cli.leaderboard:Leaderboard",
+    "bench": "hvs_suite.cli.bench:Bench",
+    "doctor": "hvs_suite.cli.doctor:Doctor",
+    "demo": "hvs_suite.cli.demo:Demo",
+}
+
+USER_ERROR = 2
+INTERRUPTED = 130
+
+
+class Command(Protocol):
+    """What every command offers."""
+
+    def run(self) -> int | None:
+        """Do it; the exit code, where it is not 0."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run ``hvs`` and exit.
+
+    Args:
+        arguments: Words after ``hvs``; those of the process by default.
+    """
+    sys.exit(run(sys.argv[1:] if arguments is None else arguments))
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run one command and return its exit code.
+
+    Args:
+        arguments: Words after ``hvs``.
+    """
+    try:
+        return parse(arguments).run() or 0
+    except SystemExit as end:  # the parser has printed help or its complaint
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    except HvsError as error:
+        complain(str(error))
+        return USER_ERROR
+    except KeyboardInterrupt:
+        complain("interrupted")
+        return INTERRUPTED
+    except BrokenPipeError:
+        # `hvs tasks | head` closed the pipe; the interpreter's own flush at exit would complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def complain(reason: str) -> None:
+    """Print one line to stderr, whatever line breaks the reason holds."""
+    print(f"hvs: {' '.join(reason.split())}", file=sys.stderr)
+
+
+def parse(arguments: Sequence[str]) -> Command:
+    """Build the command that the words ask for.
+
+    Raises:
+        SystemExit: After help (0), or after one line about words that make no sense (2).
+    """
+    import tyro
+
+    errors = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(errors):
+            command: Any = tyro.extras.subcommand_cli_from_dict(
+                {name: _load(where) for name, where in COMMANDS.items()},
+                prog="hvs",
+                description="Benchmark suite for hybrid visual servoing with a KUKA LBR iiwa 7.",
+                args=list(arguments),
+                config=(tyro.conf.FlagCreatePairsOff,),
+            )
+    except SystemExit as end:
+        if end.code not in (0, None):
+            complain(_one_line(errors.getvalue(), arguments))
+            raise SystemExit(USER_ERROR) from None
+        raise
+    result: Command = command
+    return result
+
+
+def _load(where: str) -> Any:
+    """Import the dataclass named ``module:Class``."""
+    module, _, name = where.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def _one_line(box: str, arguments: Sequence[str]) -> str:
+    """Shorten the parser's framed complaint to its first paragraph and where to read on."""
+    lines = []
+    for line in box.splitlines()[1:]:
+        text = line.strip("│ ╭╮╰╯─")
+        if not text:
+            if lines:
+                break
+            continue
+        lines.append(text)
+    reason = re.sub(r"\s+", " ", " ".join(lines)) or "the command line makes no sense"
+    known = [word for word in arguments[:1] if word in COMMANDS]
+    return f"{reason}; see 'hvs {' '.join([*known, '--help'])}'"

@@ -1,0 +1,71 @@
+"""Writing files so that a reader never sees half of one."""
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from hvs_suite.errors import OutputError
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Write a file under a temporary name and rename it once it is whole.
+
+    An error or an interrupt inside the block leaves whatever stood at ``path`` before.
+
+    Args:
+        path: The file to write; missing parent folders are made.
+
+    Yields:
+        A path beside it with the same suffix, to write to.
+
+    Raises:
+        OutputError: The folder or the file cannot be written.
+    """
+    target = Path(path)
+    check_writable(target)
+    descriptor, name = tempfile.mkstemp(
+        dir=target.parent, prefix=f".{target.stem}-", suffix=target.suffix
+    )
+    os.close(descriptor)
+    temporary = Path(name)
+    try:
+        yield temporary
+        # mkstemp makes files that only their owner may read.
+        temporary.chmod(0o666 & ~_umask())
+        temporary.replace(target)
+    except OSError as error:
+        raise OutputError(f"cannot write {target}: {error.strerror or error}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def check_writable(path: str | os.PathLike[str]) -> None:
+    """Find out before long work that its result could not be written.
+
+    Args:
+        path: A file to be written later; missing parent folders are made now.
+
+    Raises:
+        OutputError: The folder cannot be made or written, or a folder stands at ``path``.
+    """
+    target = Path(path)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"cannot make the folder {target.parent}: {error.strerror}; choose another path"
+        ) from error
+    if target.is_dir():
+        raise OutputError(f"{target} is a folder; name a file")
+    if not os.access(target.parent, os.W_OK):
+        raise OutputError(f"cannot write into {target.parent}; choose another path")
+
+
+def _umask() -> int:
+    """The process's file mode mask, which can only be read by setting it."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
