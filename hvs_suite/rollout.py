@@ -236,7 +236,7 @@ def play[T](
         RuntimeError: Any other failure of a worker, its traceback as a note.
     """
     if workers < 1:
-        raise OptionError(f"workers must be at least 1, not {workers}.")
+        raise OptionError(f"workers must be at least 1, not {workers}")
     indices = [int(scenario) for scenario in scenarios]
     workers = min(workers, len(indices))
     if workers > 1:
@@ -257,17 +257,17 @@ def _checked(action: Any, shape: Sequence[int], scenario: int, step: int) -> Act
         checked = np.array(action, dtype=np.float32)
     except (TypeError, ValueError):
         raise ActionError(
-            f"The policy returned {type(action).__name__} at {where}; an action is an array of "
-            f"shape {tuple(shape)}."
+            f"the policy returned {type(action).__name__} at {where}; an action is an array of "
+            f"shape {tuple(shape)}"
         ) from None
     if checked.shape != tuple(shape):
         raise ActionError(
-            f"The policy returned an action of shape {checked.shape} at {where}; return one of "
-            f"shape {tuple(shape)}, without a batch dimension."
+            f"the policy returned an action of shape {checked.shape} at {where}; return one of "
+            f"shape {tuple(shape)}, without a batch dimension"
         )
     if not np.all(np.isfinite(checked)):
         raise ActionError(
-            f"The policy returned NaN or infinity at {where}; actions are finite, in [-1, 1]."
+            f"the policy returned NaN or infinity at {where}; actions are finite, in [-1, 1]"
         )
     return checked
 
@@ -296,8 +296,8 @@ def _play_in_processes(job: _Job, scenarios: list[int], workers: int) -> Generat
         ForkingPickler.dumps(job)
     except Exception as error:
         raise OptionError(
-            f"With several workers, factories travel to other processes, and this one cannot "
-            f"({error}): define it at module level, or use workers=1."
+            f"with several workers, factories travel to other processes, and this one cannot "
+            f"({error}): define it at module level, or use workers=1"
         ) from error
     started: list[tuple[SpawnProcess, Connection]] = []
     try:

@@ -1,0 +1,167 @@
+"""A result file says what happened, and one that cannot be true is refused with the reason."""
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hvs_suite.errors import OutputError, ResultError
+from hvs_suite.eval import results
+from hvs_suite.rollout import Episode
+
+
+def episode(scenario: int, *, success: bool, error: float) -> Episode:
+    return Episode(
+        scenario=scenario,
+        success=success,
+        success_once=success,
+        collision=not success and scenario % 2 == 1,
+        truncated=not success and scenario % 2 == 0,
+        steps=10 + scenario,
+        steps_to_goal=10 + scenario if success else None,
+        n_clipped=scenario,
+        position_error_mm=error,
+        lateral_error_mm=error,
+        height_error_mm=0.0,
+        tilt_error_deg=2 * error,
+        actions=np.zeros((10 + scenario, 7), np.float32),
+        decision_s=0.01,
+    )
+
+
+def make_result(n: int = 5, **summary: Any) -> results.Result:
+    rows = [results.EpisodeRow.of(episode(i, success=i < 3, error=float(i) / 3)) for i in range(n)]
+    names = {"task": "align-easy", "policy": "zero", "split": "test"} | summary
+    return results.Result(
+        schema_version=1,
+        summary=results.Summary.of(**names, rows=rows),
+        metadata=results.Metadata(
+            created="2026-01-01T00:00:00+00:00",
+            suite_version="0.1.0",
+            task_version=1,
+            task_digest="abc",
+            options={},
+            policy_hash=None,
+            packages={"numpy": "2.2.6"},
+            gl_renderer="llvmpipe",
+            cpu="a processor",
+            platform="Linux-x86_64",
+        ),
+        timings=results.Timings(workers=1, wall_s=1.0, steps_per_s=50.0, decision_ms=0.1),
+        episodes=rows,
+    )
+
+
+def test_the_summary_counts_what_the_rows_say() -> None:
+    summary = make_result().summary
+    assert (summary.n_episodes, summary.n_success, summary.pc_success) == (5, 3, 60.0)
+    assert summary.pc_success_ci95 == pytest.approx([23.07, 88.24], abs=0.01)
+    assert (summary.n_collision, summary.n_clipped) == (1, 10)
+    assert summary.steps_to_goal_mean == 11.0
+    assert summary.position_error_mm.p50 == pytest.approx(2 / 3)
+    assert summary.position_error_mm.p95 == pytest.approx(3.8 / 3)
+    assert summary.position_error_mm.iqm == pytest.approx(2 / 3)
+    assert summary.tilt_error_deg.p50 == pytest.approx(4 / 3)
+
+
+def test_steps_to_the_goal_are_null_without_a_success() -> None:
+    rows = [results.EpisodeRow.of(episode(0, success=False, error=1.0))]
+    assert results.Summary.of("t", "p", "test", rows).steps_to_goal_mean is None
+
+
+def test_a_written_result_reads_back_the_same(tmp_path: Path) -> None:
+    path = tmp_path / "zero" / "align-easy.json"
+    results.write(make_result(), path)
+    assert results.load(path) == make_result()
+    assert [file.name for file in path.parent.iterdir()] == ["align-easy.json"]
+
+
+def test_each_row_stands_on_its_own_line_with_the_fixed_keys(tmp_path: Path) -> None:
+    path = tmp_path / "result.json"
+    results.write(make_result(), path)
+    content = json.loads(path.read_text())
+    keys = "scenario success success_once collision truncated steps steps_to_goal n_clipped"
+    assert list(content["episodes"][0]) == [*keys.split(), *results.ERRORS]
+    lines = path.read_text().splitlines()
+    assert json.dumps(content["episodes"][1]) + "," in [line.strip() for line in lines]
+
+
+def test_a_result_cannot_be_written_below_a_file(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="file"):
+        results.write(make_result(), tmp_path / "file" / "result.json")
+
+
+BROKEN: dict[str, tuple[Any, str]] = {
+    "missing block": (lambda c: c.pop("metadata"), "metadata: Field required"),
+    "unknown key": (lambda c: c["summary"].update(extra=1), "summary.extra"),
+    "other schema": (lambda c: c.update(schema_version=99), "schema_version is 99"),
+    "no schema": (lambda c: c.pop("schema_version"), "schema_version is None"),
+    "no rows": (lambda c: c.update(episodes=[]), "episodes"),
+    "text for a number": (lambda c: c["episodes"][0].update(steps="10"), "episodes.0.steps"),
+    "a negative error": (
+        lambda c: c["episodes"][0].update(tilt_error_deg=-1.0),
+        "episodes.0.tilt_error_deg",
+    ),
+    "an infinite error": (
+        lambda c: c["episodes"][0].update(tilt_error_deg=float("inf")),
+        "episodes.0.tilt_error_deg",
+    ),
+    "a scenario twice": (
+        lambda c: c["episodes"].insert(1, copy.deepcopy(c["episodes"][0])),
+        "scenario 0 appears more than once",
+    ),
+    "a scenario left out": (lambda c: c["episodes"].pop(3), "scenarios 0..N-1"),
+    "another order": (lambda c: c["episodes"].reverse(), "in this order"),
+    "a success without its steps": (
+        lambda c: c["episodes"][0].update(steps_to_goal=None),
+        "steps_to_goal must equal",
+    ),
+    "two ends": (
+        lambda c: c["episodes"][0].update(collision=True),
+        "exactly one of",
+    ),
+    "a flattered summary": (
+        lambda c: c["summary"].update(pc_success=100.0),
+        "summary.pc_success is not what the episodes give",
+    ),
+    "a flattered error": (
+        lambda c: c["summary"]["tilt_error_deg"].update(p95=0.0),
+        "summary.tilt_error_deg is not",
+    ),
+    "a flattered row": (
+        lambda c: c["episodes"][4].update(position_error_mm=0.0),
+        "summary.position_error_mm is not",
+    ),
+}
+
+
+@pytest.mark.parametrize("how", BROKEN)
+def test_a_file_that_cannot_be_true_is_refused(how: str, tmp_path: Path) -> None:
+    path = tmp_path / "result.json"
+    results.write(make_result(), path)
+    content = json.loads(path.read_text())
+    tamper, reason = BROKEN[how]
+    tamper(content)
+    path.write_text(json.dumps(content))
+    with pytest.raises(ResultError) as caught:
+        results.load(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert reason in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", ["", "[1, 2", "[]", "null", "\xff"])
+def test_what_is_no_result_is_refused(content: str, tmp_path: Path) -> None:
+    path = tmp_path / "result.json"
+    path.write_text(content, encoding="latin-1")
+    with pytest.raises(ResultError, match=r"result\.json"):
+        results.load(path)
+
+
+def test_a_missing_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ResultError, match="cannot be read"):
+        results.load(tmp_path / "none.json")
