@@ -1,0 +1,207 @@
+"""``hvs show``: one picture that tells what a task looks like, and its certificate."""
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import numpy.typing as npt
+import tyro
+
+from hvs_suite.cli import console
+from hvs_suite.cli.tasks import disturbances, tolerance
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from hvs_suite.cell.environment import Environment
+    from hvs_suite.tasks.variants import AlignVariant
+
+CELL_PX = 720
+FIGURE_WIDTH_IN = 12.0
+PANEL_IN = 3.8
+ROW_IN = 0.235
+DPI = 110
+INK, FAINT, RULE, PASS, FAIL = "#1e2024", "#6e7278", "#d8d9d6", "#16803c", "#be1e1e"
+
+
+@dataclasses.dataclass(frozen=True)
+class Show:
+    """Draw a task: cell and both camera images at start and goal, and its certificate.
+
+    The certificate is also printed.
+
+    Attributes:
+        task: A named task, such as align-thesis.
+        out: Picture to write (.png).
+        scenario: Index of the test scenario to draw.
+    """
+
+    task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
+    out: Path
+    scenario: int = 0
+
+    def run(self) -> None:
+        """Draw the picture and print the certificate."""
+        import hvs_suite
+        from hvs_suite.errors import OutputError
+        from hvs_suite.files import check_writable, replacing
+        from hvs_suite.tasks.certificate import load_certificate
+
+        if self.out.suffix.lower() != ".png":
+            raise OutputError(f"{self.out} must end in .png")
+        check_writable(self.out)
+        with hvs_suite.load(self.task, split="test") as env:
+            rows = certificate_rows(load_certificate(self.task))
+            start, goal = look(env, self.scenario)
+            figure = draw(env.variant, self.scenario, start, goal, rows)
+        with replacing(self.out) as temporary:
+            figure.savefig(temporary, dpi=DPI, facecolor="white")
+        console.print_table(
+            (f"{self.task}: certificate", "found", "needed", ""),
+            [(row.what, row.found, row.needed, "ok" if row.holds else "FAILS") for row in rows],
+        )
+        print(f"wrote {self.out}")
+
+
+@dataclasses.dataclass(frozen=True)
+class CertificateRow:
+    """One line of a certificate.
+
+    Attributes:
+        what: What was checked.
+        found: What was found over all test scenarios.
+        needed: The bound it has to keep; empty where the figure is for information.
+        holds: Whether it keeps it.
+    """
+
+    what: str
+    found: str
+    needed: str
+    holds: bool
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Moment:
+    """How the cell looks at one moment.
+
+    Attributes:
+        caption: Which moment.
+        cell: Third-person view, uint8 (H, W, 3).
+        eih: Eye-in-hand image as observed, uint8 (H, W, 3).
+        eth: Eye-to-hand image as observed, uint8 (H, W, 3).
+    """
+
+    caption: str
+    cell: npt.NDArray[np.uint8]
+    eih: npt.NDArray[np.uint8]
+    eth: npt.NDArray[np.uint8]
+
+
+def look(env: "Environment", scenario: int) -> tuple[Moment, Moment]:
+    """Look at a scenario's start, and at its end after the expert has solved it."""
+    from hvs_suite.policies.catalogue import policy_factory
+    from hvs_suite.rollout import run_episode
+
+    def moment(caption: str, observation: Any) -> Moment:
+        from hvs_suite.pictures import as_rgb
+
+        return Moment(
+            caption,
+            env.render(width=CELL_PX, height=CELL_PX),
+            as_rgb(observation["eih"]),
+            as_rgb(observation["eth"]),
+        )
+
+    last: dict[str, Any] = {}
+
+    def keep(_seen: Any, _action: Any, _executed: Any, time_step: Any, _info: Any) -> None:
+        last["observation"] = time_step.observation
+
+    start = moment("start", env.reset(scenario=scenario).observation)
+    episode = run_episode(env, policy_factory("expert", env.variant.name)(env), scenario, keep)
+    how = "goal" if episode.success else "end, not solved"
+    return start, moment(f"{how}, step {episode.steps} of the expert", last["observation"])
+
+
+def draw(
+    variant: "AlignVariant", scenario: int, start: Moment, goal: Moment, rows: list[CertificateRow]
+) -> "Figure":
+    """Lay out the picture: start above goal, cell and cameras side by side, certificate below.
+
+    Args:
+        variant: The task's parameters.
+        scenario: Index that was drawn.
+        start: The cell after the reset.
+        goal: The cell at the goal.
+        rows: The certificate.
+
+    Returns:
+        The figure.
+    """
+    from matplotlib.figure import Figure
+
+    table_in = ROW_IN * (len(rows) + 2)
+    head_in, gap_in, edge_in = 0.95, 0.42, 0.25
+    height = head_in + 2 * (PANEL_IN + gap_in) + table_in + edge_in
+    figure = Figure(figsize=(FIGURE_WIDTH_IN, height))
+
+    def put_text(x_in: float, y_in: float, text: str, **style: Any) -> None:
+        figure.text(x_in / FIGURE_WIDTH_IN, 1 - y_in / height, text, va="top", **style)
+
+    put_text(edge_in, 0.2, f"{variant.name}-v{variant.version}", size=19, weight="bold", color=INK)
+    put_text(
+        edge_in,
+        0.62,
+        f"{tolerance(variant)}"
+        + (f", held {variant.hold_steps} steps" if variant.hold_steps > 1 else "")
+        + f"; {variant.time_limit_steps} steps of {variant.control_period_s:g} s"
+        + f"; {variant.target_diameter_m * 1000:.0f} mm {variant.marker}"
+        + f"; varied: {disturbances(variant).replace('-', 'nothing else', 1)}"
+        + f"; test scenario {scenario}",
+        size=10,
+        color=FAINT,
+    )
+    step = (FIGURE_WIDTH_IN - 2 * edge_in - 3 * PANEL_IN) / 2 + PANEL_IN
+    for row, moment in enumerate((start, goal)):
+        top = head_in + row * (PANEL_IN + gap_in)
+        panels = (
+            (f"cell, {moment.caption}", moment.cell, "antialiased"),
+            (f"eye in hand, {moment.eih.shape[1]} px", moment.eih, "nearest"),
+            (f"eye to hand, {moment.eth.shape[1]} px", moment.eth, "nearest"),
+        )
+        for column, (title, image, interpolation) in enumerate(panels):
+            left = edge_in + column * step
+            put_text(left, top, title, size=10.5, color=INK)
+            axes = figure.add_axes(
+                (
+                    left / FIGURE_WIDTH_IN,
+                    1 - (top + 0.24 + PANEL_IN) / height,
+                    PANEL_IN / FIGURE_WIDTH_IN,
+                    PANEL_IN / height,
+                )
+            )
+            axes.imshow(image, interpolation=interpolation)
+            axes.set_axis_off()
+    _draw_table(put_text, height - edge_in - table_in + 0.05, edge_in, rows)
+    return figure
+
+
+def _draw_table(put_text: Any, top: float, left: float, rows: list[CertificateRow]) -> None:
+    """Write the certificate's rows, one line each."""
+    columns = (left, left + 5.2, left + 8.4, left + 11.1)
+    headings = ("certificate over all test scenarios", "found", "needed", "")
+    for x, heading in zip(columns, headings, strict=True):
+        put_text(x, top, heading, size=9.5, weight="bold", color=INK)
+    for index, row in enumerate(rows):
+        y = top + ROW_IN * (index + 1.15)
+        for x, cell in zip(columns, (row.what, row.found, row.needed), strict=False):
+            put_text(x, y, cell, size=9.5, color=INK)
+        put_text(
+            columns[3],
+            y,
+            "ok" if row.holds else "FAILS",
+            size=9.5,
+            weight="bold",
+            color=PASS if row.holds else FAIL,
+        )
