@@ -5,7 +5,7 @@ import dataclasses
 import multiprocessing
 import statistics
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
@@ -121,12 +121,14 @@ class TimedEpisode:
         controls: Actuator controls of each control step, each (7,).
         reset_s: Time of the reset (s).
         step_s: Time of all steps together (s).
+        observation: What the last step showed.
     """
 
     start: npt.NDArray[np.float64]
     controls: list[npt.NDArray[np.float64]]
     reset_s: float
     step_s: float
+    observation: Mapping[str, npt.NDArray[Any]]
 
 
 def run_once(env: "Environment", scenario: int) -> TimedEpisode:
@@ -159,7 +161,7 @@ def run_once(env: "Environment", scenario: int) -> TimedEpisode:
         controls.append(data.ctrl.copy())
         if time_step.last():
             break
-    return TimedEpisode(start, controls, reset_s, step_s)
+    return TimedEpisode(start, controls, reset_s, step_s, time_step.observation)
 
 
 class BareLoop:

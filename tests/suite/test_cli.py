@@ -1,0 +1,238 @@
+"""The ``hvs`` command as a person or a script meets it: output, exit codes, one-line errors."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from hvs_suite.cli.main import COMMANDS, run
+
+TASKS = (
+    "align-fixed",
+    "align-easy",
+    "align-thesis",
+    "align-hard",
+    "align-drill",
+    "align-limit",
+)
+
+
+def refusal(capsys, *words):
+    """Run a command that must be refused; the one line it says."""
+    assert run(words) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert err.startswith("hvs: ")
+    return err
+
+
+def test_help_names_every_command(capsys):
+    assert run(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert [name for name in COMMANDS if name not in text] == []
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_each_command_explains_each_of_its_options(command, capsys):
+    assert run([command, "--help"]) == 0
+    assert f"usage: hvs {command}" in capsys.readouterr().out
+
+
+def test_hvs_is_installed_as_a_command():
+    done = subprocess.run(
+        [sys.executable, "-c", "from hvs_suite.cli.main import main; main()", "tasks"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "align-thesis-v1" in done.stdout
+
+
+def test_tasks_prints_json_that_a_script_can_read(capsys):
+    assert run(["tasks", "--json"]) == 0
+    tasks = json.loads(capsys.readouterr().out)
+    assert tuple(task["name"] for task in tasks) == TASKS
+    assert {"version", "instruction", "time_limit_steps", "tilt_tolerance_deg"} <= set(tasks[0])
+
+
+def test_tasks_prints_a_row_for_each_task(capsys):
+    assert run(["tasks"]) == 0
+    text = capsys.readouterr().out
+    assert [name for name in TASKS if f"{name}-v" not in text] == []
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["dance"], "dance"),
+        ([], "hvs"),
+        (["tasks", "--jsn"], "--jsn"),
+        (["bench"], "--task"),
+        (["bench", "--task", "align-thesis", "--seconds", "long"], "--seconds"),
+    ],
+)
+def test_words_that_make_no_sense_are_refused_in_one_line(words, reason, capsys):
+    assert reason in refusal(capsys, *words)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["show", "align-thesys", "--out", "{folder}/picture.png"],
+        ["view", "align-thesys", "--out", "{folder}/film.gif"],
+        ["bench", "--task", "align-thesys"],
+        ["record", "--task", "align-thesys", "--episodes", "1", "--out", "{folder}/data"],
+        ["evaluate", "--policy", "zero", "--task", "align-thesys", "--out", "{folder}/r.json"],
+    ],
+)
+def test_unknown_task_is_refused_with_the_nearest_name(words, tmp_path, capsys):
+    assert "align-thesis" in refusal(capsys, *(w.format(folder=tmp_path) for w in words))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["show", "align-easy", "--out", "{file}/picture.png"], "choose another path"),
+        (["show", "align-easy", "--out", "{folder}/picture.txt"], ".png"),
+        (["view", "align-easy", "--out", "{folder}/film.mov"], ".mp4"),
+        (["view", "align-easy", "--out", "{file}/film.gif"], "choose another path"),
+        (["view", "align-easy", "--out", "{folder}/f.gif", "--scenario", "-1"], "-1"),
+        (["view", "align-easy", "--out", "{folder}/f.gif", "--split", "test",
+          "--scenario", "1000"], "1000"),
+        (["view", "align-easy", "--out", "{folder}/f.gif", "--policy", "nobody"], "nobody"),
+        (["bench", "--task", "align-easy", "--seconds", "0"], "--seconds"),
+        (["record", "--task", "align-easy", "--episodes", "0", "--out", "{folder}/d"], "episodes"),
+        (["record", "--task", "align-easy", "--episodes", "1", "--out", "{full}"], "--resume"),
+        (["pretrain", "--data", "{folder}/none", "--out", "{folder}/p"], "none"),
+        (["demo", "--out", "{full}"], "--overwrite"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_refused_in_one_line_that_says_why(words, reason, tmp_path, capsys):
+    (tmp_path / "file").touch()
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes.txt").touch()
+    places = {"folder": tmp_path, "file": tmp_path / "file", "full": tmp_path / "full"}
+    assert reason in refusal(capsys, *(word.format(**places) for word in words))
+
+
+def test_view_without_a_display_asks_for_a_file(monkeypatch, capsys):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    assert "--out" in refusal(capsys, "view", "align-easy")
+
+
+def test_show_writes_a_picture_and_prints_the_certificate(tmp_path, capsys):
+    from PIL import Image
+
+    out = tmp_path / "pictures" / "easy.png"
+    assert run(["show", "align-easy", "--out", str(out)]) == 0
+    assert "certificate" in capsys.readouterr().out
+    with Image.open(out) as picture:
+        assert picture.format == "PNG"
+        assert min(picture.size) > 800
+    assert [p.name for p in out.parent.iterdir()] == ["easy.png"]
+
+
+@pytest.mark.parametrize("suffix", ["gif", "mp4"])
+def test_view_films_every_control_step(suffix, tmp_path):
+    import imageio.v3 as iio
+
+    out = tmp_path / f"film.{suffix}"
+    assert run(["view", "align-easy", "--policy", "zero", "--out", str(out)]) == 0
+    frames = iio.imread(out, plugin="pyav" if suffix == "mp4" else "pillow")
+    assert len(frames) == 1 + 20
+    assert frames[0].std() > 10
+
+
+def test_bench_prints_every_figure_as_json(capsys):
+    assert run(["bench", "--task", "align-easy", "--seconds", "0.3", "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["task"] == "align-easy"
+    assert min(value for name, value in figures.items() if name != "task") > 0
+    assert {
+        "steps_per_s",
+        "bare_steps_per_s",
+        "ratio",
+        "reset_ms",
+        "steps_per_s_no_cameras",
+        "two_worker_steps_per_s",
+        "two_worker_speedup",
+    } <= set(figures)
+
+
+def test_bench_compares_with_a_loop_that_ends_in_the_same_pictures():
+    import numpy as np
+
+    import hvs_suite
+    from hvs_suite.cli.bench import BareLoop, run_once
+
+    with hvs_suite.load("align-thesis") as env:
+        episode = run_once(env, 3)
+        bare = BareLoop(env)
+        bare.restore(episode.start)
+        for control in episode.controls:
+            pictures = bare.step(control)
+        bare.close()
+    for name, picture in zip(("eih", "eth"), pictures, strict=True):
+        difference = np.abs(picture.astype(int) - episode.observation[name])
+        assert difference.mean() < 0.1
+
+
+def test_doctor_names_the_backend_in_use(capsys):
+    assert run(["doctor", "--json"]) == 0
+    findings = json.loads(capsys.readouterr().out)
+    assert findings["renders"] is True
+    assert findings["renderers"][findings["backend_in_use"]]["works"] is True
+    assert findings["versions"]["mujoco"].startswith("3.")
+
+
+def test_doctor_names_the_package_that_a_missing_library_needs(monkeypatch):
+    from hvs_suite.cli import doctor
+
+    monkeypatch.setattr(doctor.ctypes.util, "find_library", lambda _name: None)
+    for backend, package in (("egl", "libegl1"), ("osmesa", "libosmesa6"), ("glfw", "libgl1")):
+        probe = doctor.probe_renderer(backend)
+        assert not probe.works
+        assert f"apt-get install {package}" in probe.remedy
+
+
+def test_interrupting_a_command_ends_it_with_130(monkeypatch, capsys):
+    from hvs_suite.cli.tasks import Tasks
+
+    def interrupt(_self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Tasks, "run", interrupt)
+    assert run(["tasks"]) == 130
+    assert capsys.readouterr().err == "hvs: interrupted\n"
+
+
+def test_defects_of_ours_keep_their_traceback(monkeypatch):
+    from hvs_suite.cli.tasks import Tasks
+
+    def fail(_self):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(Tasks, "run", fail)
+    with pytest.raises(ZeroDivisionError):
+        run(["tasks"])
+
+
+def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(tmp_path):
+    from hvs_suite.files import replacing
+
+    path = tmp_path / "result.json"
+    path.write_text("old")
+
+    def interrupted_write():
+        with replacing(path) as temporary:
+            temporary.write_text("half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted_write()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
