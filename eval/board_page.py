@@ -29,14 +29,14 @@ h2 { margin: 2.75rem 0 .25rem; font-size: 1.25rem; }
 p { margin: .4rem 0 1rem; max-width: 46rem; color: var(--soft); }
 .sheet { overflow-x: auto; background: var(--card); border: 1px solid var(--line);
   border-radius: 10px; }
-table { width: 100%; border-collapse: collapse; font-variant-numeric: tabular-nums; }
+table { width: 100%; border-collapse: separate; border-spacing: 0; font-variant-numeric: tabular-nums; }
 th, td { padding: .6rem .8rem; text-align: right; border-bottom: 1px solid var(--line);
   white-space: nowrap; }
 tbody tr:last-child > * { border-bottom: 0; }
 thead th { font-size: .8rem; font-weight: 500; color: var(--soft); vertical-align: bottom;
   white-space: normal; line-height: 1.25; }
 th:first-child { text-align: left; }
-tbody th { font-weight: 600; white-space: normal; overflow-wrap: anywhere; min-width: 7rem; }
+tbody th { font-weight: 600; min-width: 6rem; }
 thead button { all: unset; cursor: pointer; }
 thead button:hover, thead [aria-sort] button { color: var(--ink); }
 thead button:focus-visible { outline: 2px solid var(--mark); outline-offset: 3px; }
@@ -46,7 +46,7 @@ svg { display: block; width: 100%; min-width: 7rem; height: 12px; }
 .track { fill: var(--track); } .band { fill: var(--band); } .mark { fill: var(--mark); }
 td.success { min-width: 9rem; } td.success b { font-weight: 600; }
 .matrix small { display: block; color: var(--soft); font-size: .78rem; }
-.matrix tbody th { position: sticky; left: 0; background: var(--card); }
+.matrix th:first-child { position: sticky; left: 0; background: var(--card); }
 footer { margin-top: 3rem; color: var(--soft); font-size: .85rem; }
 label { display: none; }
 @media (max-width: 44rem) {
@@ -58,7 +58,8 @@ label { display: none; }
   .task tr { display: grid; grid-template-columns: 1fr 1fr; gap: .6rem 1rem; padding: 1rem;
     margin-bottom: .75rem; background: var(--card); border: 1px solid var(--line);
     border-radius: 10px; }
-  .task th, .task td { padding: 0; border: 0; text-align: left; white-space: normal; }
+  .task th, .task td { padding: 0; border: 0; text-align: left; white-space: normal;
+    overflow-wrap: anywhere; }
   .task th, .task td.success { grid-column: 1 / -1; }
   .task td::before { content: attr(data-title); display: block; color: var(--soft);
     font-size: .75rem; line-height: 1.2; }

@@ -49,7 +49,7 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], title: st
 
 
 @contextlib.contextmanager
-def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
+def progress(what: str, total: int) -> Iterator[Callable[..., None]]:
     """Show how far long work has come, with its rate and the time left.
 
     Args:
@@ -57,7 +57,7 @@ def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
         total: Units of work.
 
     Yields:
-        A function to call after each unit.
+        A function to call after each unit, if need be with a few words on how it goes.
     """
     if sys.stderr.isatty():
         from rich import progress as rich_progress
@@ -68,27 +68,29 @@ def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
             rich_progress.BarColumn(),
             rich_progress.MofNCompleteColumn(),
             rich_progress.TimeRemainingColumn(),
+            rich_progress.TextColumn("{task.fields[note]}"),
             console=Console(stderr=True),
         )
         with bar:
-            task = bar.add_task(what, total=total)
-            yield lambda: bar.advance(task)
+            task = bar.add_task(what, total=total, note="")
+            yield lambda note="": bar.update(task, advance=1, note=note)
         return
     yield _plain_progress(what, total)
 
 
-def _plain_progress(what: str, total: int) -> Callable[[], None]:
+def _plain_progress(what: str, total: int) -> Callable[..., None]:
     """A function that counts, and prints a line every ten seconds and at the end."""
     started = last = time.monotonic()
     done = 0
 
-    def advance() -> None:
+    def advance(note: str = "") -> None:
         nonlocal done, last
         done += 1
         now = time.monotonic()
         if done == total or now - last >= PLAIN_PROGRESS_PERIOD_S:
             last = now
             left = (now - started) / done * (total - done)
-            print(f"{what}: {done}/{total}, {left:.0f} s left", file=sys.stderr, flush=True)
+            words = f"{note}, " if note else ""
+            print(f"{what}: {done}/{total}, {words}{left:.0f} s left", file=sys.stderr, flush=True)
 
     return advance
