@@ -29,7 +29,8 @@ h2 { margin: 2.75rem 0 .25rem; font-size: 1.25rem; }
 p { margin: .4rem 0 1rem; max-width: 46rem; color: var(--soft); }
 .sheet { overflow-x: auto; background: var(--card); border: 1px solid var(--line);
   border-radius: 10px; }
-table { width: 100%; border-collapse: separate; border-spacing: 0; font-variant-numeric: tabular-nums; }
+table { width: 100%; border-collapse: separate; border-spacing: 0;
+  font-variant-numeric: tabular-nums; }
 th, td { padding: .6rem .8rem; text-align: right; border-bottom: 1px solid var(--line);
   white-space: nowrap; }
 tbody tr:last-child > * { border-bottom: 0; }

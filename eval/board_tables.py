@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 from hvs_suite.eval.results import Result
+from hvs_suite.tasks.variants import TASKS
 
 NOTE = (
     "Success is the share of scenarios solved, with its Wilson 95 % interval. Errors are taken at "
@@ -105,12 +106,13 @@ COLUMNS = (
 
 
 def by_task(entries: Sequence[Entry]) -> dict[str, list[Entry]]:
-    """Returns the entries of each task, tasks by name, best entry first.
+    """Returns the entries of each task, easiest task first, best entry first.
 
     Equal success is decided by the median position error, then by name.
     """
     tables: dict[str, list[Entry]] = {}
-    for entry in sorted(entries, key=lambda e: e.task):
+    names = list(TASKS)
+    for entry in sorted(entries, key=lambda e: names.index(e.result.summary.task)):
         tables.setdefault(entry.task, []).append(entry)
     for table in tables.values():
         table.sort(

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from hvs_suite import files
+from hvs_suite import files, registry
 from hvs_suite.errors import HvsError, ResultError
 from hvs_suite.eval import results
 from hvs_suite.eval.board_page import page
@@ -47,6 +47,7 @@ def collect(results_folder: Path) -> list[Entry]:
 
     Raises:
         ResultError: Names the file and the reason.
+        UnknownTaskError: A result names a task that does not exist.
     """
     paths = sorted(results_folder.rglob("*.json"))
     if not paths:
@@ -61,6 +62,12 @@ def collect(results_folder: Path) -> list[Entry]:
         if len(rest) != 1:
             raise ResultError(f"{path}: results lie as {results_folder}/<policy>/<task>.json")
         entry = Entry(policy, results.load(path))
+        variant = registry.find(entry.result.summary.task)
+        if entry.result.metadata.task_version != variant.version:
+            raise ResultError(
+                f"{path}: played on {entry.task}, but this hvs_suite has v{variant.version}; "
+                "evaluate again"
+            )
         if path.stem != entry.result.summary.task:
             raise ResultError(
                 f"{path}: the file is named after one task, but holds a result of "
@@ -84,7 +91,6 @@ def _check_pair(path: Path, entry: Entry, earlier_path: Path, earlier: Entry) ->
     if ours.summary.task != theirs.summary.task:
         return
     for what, mine, other in (
-        ("task_version", ours.metadata.task_version, theirs.metadata.task_version),
         ("task_digest", ours.metadata.task_digest, theirs.metadata.task_digest),
         ("split", ours.summary.split, theirs.summary.split),
     ):

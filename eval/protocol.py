@@ -6,8 +6,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import hvs_suite
-from hvs_suite import rollout
+from hvs_suite import registry, rollout
 from hvs_suite.errors import OptionError, ScenarioError
 from hvs_suite.eval import provenance, results
 from hvs_suite.policies.catalogue import policy_factory
@@ -29,7 +28,7 @@ class MakeTask:
 
     def __call__(self) -> rollout.Environment:
         """Returns a new environment."""
-        env: rollout.Environment = hvs_suite.load(self.task, split=self.split)
+        env: rollout.Environment = registry.load(self.task, split=self.split)
         return env
 
 
@@ -68,7 +67,7 @@ def evaluate(
             f"split {TEST_SPLIT!r} holds {TEST_SCENARIOS} scenarios, not {episodes}; ask for "
             f"{TEST_SCENARIOS} episodes or fewer"
         )
-    variant = hvs_suite.TASKS[task]
+    variant = registry.find(task)
     make_policy = policy_factory(policy, task)
     renderer = provenance.gl_renderer()
     created = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")

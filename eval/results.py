@@ -9,14 +9,14 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 import pydantic
 
 from hvs_suite import files, rollout, statistics
 from hvs_suite.errors import ResultError
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION: Final = 1
 ERRORS = ("position_error_mm", "lateral_error_mm", "height_error_mm", "tilt_error_deg")
 
 Count = Annotated[int, pydantic.Field(ge=0)]

@@ -121,7 +121,7 @@ def test_one_bad_result_stops_the_build_and_leaves_the_old_board(
 @pytest.mark.parametrize(
     ("metadata", "reason"),
     [
-        ({"task_version": 2}, "task_version is"),
+        ({"task_version": 2}, "align-easy-v2, but this hvs_suite has v1"),
         ({"task_digest": "other"}, "task_digest is"),
         ({"split": "train"}, "split is"),
         ({"options": {"hold_steps": 1}}, r"task was changed \(hold_steps\)"),
