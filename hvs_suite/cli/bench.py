@@ -23,7 +23,7 @@ WORKER_ROUNDS = 3
 REACH_RAD = 0.3
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Bench:
     """Measure how fast a task steps on this machine.
 

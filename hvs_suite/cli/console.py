@@ -5,6 +5,7 @@ Rich draws where a person looks on; a pipe or a log file gets plain lines.
 
 import contextlib
 import json
+import re
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,12 +14,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rich.console import Console
 
-PLAIN_WIDTH = 120
+PLAIN_WIDTH = 160
+FIGURE = re.compile(r"[-+]?[0-9.]+( ?%)?|-")
 PLAIN_PROGRESS_PERIOD_S = 10.0
 
 
 def console() -> "Console":
-    """The console on stdout; at least 120 columns wide where stdout is no terminal."""
+    """The console on stdout; 160 columns wide where stdout is no terminal."""
     from rich.console import Console
 
     return Console(highlight=False, width=None if sys.stdout.isatty() else PLAIN_WIDTH)
@@ -30,7 +32,7 @@ def print_json(content: Mapping[str, Any] | Sequence[Any]) -> None:
 
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], title: str = "") -> None:
-    """Print a table; a first column of names, then right-aligned figures.
+    """Print a table; columns of figures are right-aligned.
 
     Args:
         columns: Headings.
@@ -42,7 +44,8 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], title: st
 
     table = Table(title=title or None, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
     for index, column in enumerate(columns):
-        table.add_column(column, justify="left" if index == 0 else "right")
+        figures = all(FIGURE.fullmatch(row[index]) for row in rows)
+        table.add_column(column, justify="right" if figures else "left")
     for row in rows:
         table.add_row(*row)
     console().print(table)

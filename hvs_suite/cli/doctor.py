@@ -60,7 +60,7 @@ class Probe:
     remedy: str = ""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Doctor:
     """Check rendering, versions and video decoders on this machine.
 

@@ -5,10 +5,11 @@ stderr that says how to mend it), 130 when interrupted. Only defects of ours sho
 """
 
 import contextlib
+import difflib
 import importlib
+import inspect
 import io
 import os
-import re
 import sys
 from collections.abc import Sequence
 from typing import Any, Protocol
@@ -83,25 +84,36 @@ def parse(arguments: Sequence[str]) -> Command:
     Raises:
         SystemExit: After help (0), or after one line about words that make no sense (2).
     """
+    if not arguments:
+        complain(f"name a command: {', '.join(COMMANDS)}; see 'hvs --help'")
+        raise SystemExit(USER_ERROR)
+    name, *rest = arguments
+    if name in ("-h", "--help"):
+        print(_overview())
+        raise SystemExit(0)
+    if name not in COMMANDS:
+        close = difflib.get_close_matches(name, COMMANDS, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"choose from {', '.join(COMMANDS)}"
+        complain(f"unknown command {name!r}; {hint}")
+        raise SystemExit(USER_ERROR)
+
     import tyro
 
     errors = io.StringIO()
     try:
         with contextlib.redirect_stderr(errors):
-            command: Any = tyro.extras.subcommand_cli_from_dict(
-                {name: _load(where) for name, where in COMMANDS.items()},
-                prog="hvs",
-                description="Benchmark suite for hybrid visual servoing with a KUKA LBR iiwa 7.",
-                args=list(arguments),
+            command: Command = tyro.cli(
+                _load(COMMANDS[name]),
+                prog=f"hvs {name}",
+                args=rest,
                 config=(tyro.conf.FlagCreatePairsOff,),
             )
     except SystemExit as end:
-        if end.code not in (0, None):
-            complain(_one_line(errors.getvalue(), arguments))
-            raise SystemExit(USER_ERROR) from None
-        raise
-    result: Command = command
-    return result
+        if end.code in (0, None):
+            raise
+        complain(f"{_reason(errors.getvalue())}; see 'hvs {name} --help'")
+        raise SystemExit(USER_ERROR) from None
+    return command
 
 
 def _load(where: str) -> Any:
@@ -110,16 +122,27 @@ def _load(where: str) -> Any:
     return getattr(importlib.import_module(module), name)
 
 
-def _one_line(box: str, arguments: Sequence[str]) -> str:
-    """Shorten the parser's framed complaint to its first paragraph and where to read on."""
-    lines = []
+def _overview() -> str:
+    """Help of ``hvs`` itself: each command with the first line of its description."""
+    lines = [
+        "usage: hvs COMMAND [OPTIONS]",
+        "",
+        "Benchmark suite for hybrid visual servoing with a KUKA LBR iiwa 7.",
+        "",
+    ]
+    for name, where in COMMANDS.items():
+        lines.append(f"  {name:<13}{inspect.getdoc(_load(where)).partition('\n')[0]}")
+    return "\n".join([*lines, "", "'hvs COMMAND --help' explains the options of a command."])
+
+
+def _reason(box: str) -> str:
+    """Shorten the parser's framed complaint to its first paragraph, without options' help texts."""
+    found: list[str] = []
     for line in box.splitlines()[1:]:
-        text = line.strip("│ ╭╮╰╯─")
-        if not text:
-            if lines:
-                break
-            continue
-        lines.append(text)
-    reason = re.sub(r"\s+", " ", " ".join(lines)) or "the command line makes no sense"
-    known = [word for word in arguments[:1] if word in COMMANDS]
-    return f"{reason}; see 'hvs {' '.join([*known, '--help'])}'"
+        text = line.strip().strip("│")
+        if not text.strip(" ─╰╯"):
+            break
+        # Names of options are indented once, their help texts twice.
+        if not text.startswith(" " * 9):
+            found.append(text.strip())
+    return " ".join(found) or "the command line makes no sense"

@@ -25,7 +25,7 @@ DPI = 110
 INK, FAINT, RULE, PASS, FAIL = "#1e2024", "#6e7278", "#d8d9d6", "#16803c", "#be1e1e"
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Show:
     """Draw a task: cell and both camera images at start and goal, and its certificate.
 

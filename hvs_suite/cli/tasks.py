@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from hvs_suite.tasks.variants import AlignVariant
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Tasks:
     """List the named tasks.
 
@@ -30,7 +30,7 @@ class Tasks:
             )
             return
         console.print_table(
-            ("task", "start", "target", "tolerance", "hold", "steps", "EIH px", "ETH px", "varied"),
+            ("task", "start", "target", "tolerance", "held", "steps", "EIH, ETH px", "varied"),
             [
                 (
                     f"{v.name}-v{v.version}",
@@ -39,8 +39,7 @@ class Tasks:
                     tolerance(v),
                     str(v.hold_steps),
                     f"{v.time_limit_steps} x {v.control_period_s:g} s",
-                    str(v.eih_resolution),
-                    str(v.eth_resolution),
+                    f"{v.eih_resolution}, {v.eth_resolution}",
                     disturbances(v),
                 )
                 for v in variants
@@ -56,7 +55,7 @@ def tolerance(variant: "AlignVariant") -> str:
     if variant.lateral_tolerance_mm is not None:
         parts.append(f"{variant.lateral_tolerance_mm:g} mm sideways")
     if variant.height_tolerance_mm is not None:
-        parts.append(f"{variant.height_tolerance_mm:g} mm high")
+        parts.append(f"{variant.height_tolerance_mm:g} mm in height")
     return ", ".join([*parts, f"{variant.tilt_tolerance_deg:g} deg"])
 
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hvs_suite.rollout import Episode, Policy
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class View:
     """Watch one episode: in a window where there is a display, or as a film.
 

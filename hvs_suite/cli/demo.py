@@ -1,0 +1,144 @@
+"""``hvs demo``: the whole pipeline once, small enough to wait for."""
+
+import dataclasses
+import json
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from hvs_suite.cli import console
+from hvs_suite.errors import OptionError, OutputError
+
+TASK = "align-easy"
+PARTS = ("dataset", "policy", "results", "board", "episode.gif")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Demo:
+    """Record demonstrations, train a policy on them, score it, build a board, film an episode.
+
+    Everything is real and small; a longer training gives a better policy (see hvs pretrain).
+
+    Attributes:
+        out: Folder for everything the demo makes.
+        episodes: Demonstrations to record.
+        minutes: Training time (min).
+        evaluations: Test scenarios to score the policy on.
+        overwrite: Replace what an earlier demo left in the folder.
+    """
+
+    out: Path = Path("runs/demo")
+    episodes: int = 150
+    minutes: float = 3.0
+    evaluations: int = 50
+    overwrite: bool = False
+
+    def run(self) -> None:
+        """Run the stages one after the other and report on them."""
+        from hvs_suite.cli.evaluate import Evaluate
+        from hvs_suite.cli.leaderboard import Leaderboard
+        from hvs_suite.cli.pretrain import Pretrain
+        from hvs_suite.cli.record import Record
+
+        for name in ("episodes", "minutes", "evaluations"):
+            if not getattr(self, name) > 0:
+                raise OptionError(f"--{name} must be above 0, not {getattr(self, name)}")
+        self._make_room()
+        dataset, policy = self.out / "dataset", self.out / "policy"
+        results, board = self.out / "results", self.out / "board"
+        film = self.out / "episode.gif"
+        result = results / "demo" / f"{TASK}.json"
+        times_s: dict[str, float] = {}
+
+        with _stage(f"record {self.episodes} demonstrations of {TASK}", times_s):
+            Record(task=TASK, episodes=self.episodes, out=dataset, workers=2).run()
+        with _stage(f"train a policy on them for {self.minutes:g} min", times_s):
+            Pretrain(data=dataset, out=policy, minutes=self.minutes).run()
+        with _stage(f"score it on {self.evaluations} test scenarios", times_s):
+            Evaluate(
+                policy=str(policy),
+                task=TASK,
+                split="test",
+                episodes=self.evaluations,
+                workers=2,
+                out=result,
+            ).run()
+        with _stage("build the board", times_s):
+            Leaderboard(results=results, out=board).run()
+        with _stage("film an episode", times_s):
+            film_one(policy, film)
+
+        self._report(result, board, times_s)
+
+    def _make_room(self) -> None:
+        """Refuse a folder that is in use, or clear what an earlier demo left there."""
+        if self.out.is_dir() and any(self.out.iterdir()) and not self.overwrite:
+            raise OutputError(f"{self.out} is not empty; name another --out, or use --overwrite")
+        try:
+            self.out.mkdir(parents=True, exist_ok=True)
+            # Only what a demo makes: the folder may be anything.
+            for part in PARTS:
+                path = self.out / part
+                if path.is_dir():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink(missing_ok=True)
+        except OSError as error:
+            raise OutputError(
+                f"cannot write {self.out}: {error.strerror}; choose another --out"
+            ) from error
+
+    def _report(self, result: Path, board: Path, times_s: dict[str, float]) -> None:
+        """Print the policy's success as it is, where everything lies, and what it took."""
+        summary = json.loads(result.read_text(encoding="utf-8"))["summary"]
+        low, high = summary["pc_success_ci95"]
+        console.print_table(
+            ("stage", "seconds"),
+            [
+                *((name, f"{taken:.0f}") for name, taken in times_s.items()),
+                ("all", f"{sum(times_s.values()):.0f}"),
+            ],
+        )
+        print(
+            f"{TASK}, the demo's own policy: {summary['n_success']} of {summary['n_episodes']} "
+            f"solved, {summary['pc_success']:.1f} % (95 % interval {low:.1f} to {high:.1f} %)"
+        )
+        for what, path in (
+            ("dataset", self.out / "dataset"),
+            ("policy", self.out / "policy"),
+            ("evaluation", result),
+            ("board", board / "LEADERBOARD.md"),
+            ("episode", self.out / "episode.gif"),
+        ):
+            print(f"{what:<12}{path}")
+
+
+def film_one(policy: Path, film: Path) -> None:
+    """Film test scenario 0 played by a checkpoint, whatever comes of it.
+
+    Args:
+        policy: Checkpoint folder.
+        film: GIF to write.
+    """
+    import hvs_suite
+    from hvs_suite import pictures
+    from hvs_suite.cli.view import describe
+    from hvs_suite.policies.catalogue import policy_factory
+
+    with hvs_suite.load(TASK, split="test") as env:
+        player = policy_factory(str(policy), TASK)(env)
+        episode, frames = pictures.film_episode(env, player, 0)
+        pictures.write_film(film, frames, 0.5 / env.variant.control_period_s)
+    print(describe(episode, "the demo's policy"))
+
+
+@contextmanager
+def _stage(title: str, times_s: dict[str, float]) -> Iterator[None]:
+    """Announce a stage and note how long it took."""
+    print(f"== {title}", flush=True)
+    started = time.monotonic()
+    yield
+    times_s[title] = time.monotonic() - started
+    print(f"   {times_s[title]:.0f} s", flush=True)
