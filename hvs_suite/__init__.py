@@ -1,0 +1,16 @@
+"""hvs_suite: the benchmark suite for hybrid visual servoing with a KUKA LBR iiwa 7.
+
+    import hvs_suite
+
+    env = hvs_suite.load("align-thesis", split="train")
+    time_step = env.reset(scenario=0)
+
+``hvs_suite.TASKS`` maps every task name to its parameters; ``gymnasium.make`` finds the same tasks
+as ``hvs_suite/<name>-v<version>``.
+"""
+
+from hvs_suite.registry import load
+from hvs_suite.tasks.variants import TASKS
+
+__version__ = "0.1.0"
+__all__ = ["TASKS", "load"]

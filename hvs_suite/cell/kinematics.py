@@ -129,11 +129,15 @@ class Kinematics:
         self._geometry_data = self.geometry.createData()
 
     def _add_collision_pairs(self) -> None:
-        """Pairs up all geoms except within a link and between adjacent links."""
+        """Pairs up the geoms of links at least three joints apart.
+
+        Nearer links keep a distance that their joint ranges guarantee (at least 34 mm, between the
+        forearm's end and the flange), which would hide what the configuration decides.
+        """
         objects = self.geometry.geometryObjects
         for i, first in enumerate(objects):
             for j in range(i + 1, len(objects)):
-                if abs(first.parentJoint - objects[j].parentJoint) > 1:
+                if abs(first.parentJoint - objects[j].parentJoint) > 2:
                     self.geometry.addCollisionPair(pin.CollisionPair(i, j))
         # Base and link 1 can never come closer to the surface than they stand.
         self._movable = [i for i, g in enumerate(objects) if g.parentJoint >= 2]
@@ -176,8 +180,8 @@ class Kinematics:
     def clearance(self, q: npt.ArrayLike, surface_height_m: float = 0.0) -> float:
         """Least distance (m) from links 2 to 7 to a level surface, and between distant links.
 
-        Uses the same collision geoms as MuJoCo; adjacent links are not compared. Negative where
-        bodies interpenetrate.
+        Uses the same collision geoms as MuJoCo; links less than three joints apart are not
+        compared. Negative where bodies interpenetrate.
 
         Args:
             q: Configuration (7,) in rad.

@@ -217,8 +217,8 @@ def _upper_elbow(
     bulb: list[Ring] = [
         (0.002, p, 0.002, -p, p),
         (-0.006, p, r - 0.036, -p, p),
-        (-0.014, p, r - 0.012, -p + 0.005, p),
-        (-0.022, p, r + 0.010, -0.058, p),
+        (-0.0125, p, r - 0.0125, -p + 0.005, p),
+        (-0.019, p, r + 0.010, -0.058, p),
         (-r + 0.040, p, r + 0.021, -0.038, p),
         (-r + 0.036, p + 0.002, r + 0.024, -0.005, p),
         (-r + 0.031, p + 0.007, r + 0.023, 0.022, p),
@@ -317,6 +317,35 @@ def link_shells() -> tuple[Shell, ...]:
         + _wrist()
         + _flange()
     )
+
+
+def solid_inertia(body: str) -> tuple[float, FloatArray, FloatArray]:
+    """Mass properties of a link's closed shells filled at a density of 1 kg/m^3.
+
+    The masses are published, their distribution is not: ``robot`` holds these properties, scaled to
+    the published mass. Bands and caps are open surfaces and do not count; where two solids of a
+    link overlap, the overlap counts twice.
+
+    Args:
+        body: Name of the link.
+
+    Returns:
+        Volume (m^3), centre of mass (3,) in m and inertia about it (3, 3) in m^5, link frame.
+    """
+    solids = []
+    for shell in link_shells():
+        mesh = shell.mesh.copy()
+        mesh.merge_vertices()
+        if shell.body == body and mesh.is_watertight:
+            solids.append(mesh)
+    volume = sum(float(solid.volume) for solid in solids)
+    centre = sum(solid.volume * solid.center_mass for solid in solids) / volume
+    inertia = np.zeros((3, 3))
+    for solid in solids:
+        arm = solid.center_mass - centre
+        steiner = arm @ arm * np.eye(3) - np.outer(arm, arm)
+        inertia += solid.moment_inertia + solid.volume * steiner
+    return volume, np.asarray(centre), inertia
 
 
 def add_shells(root: mjcf.RootElement) -> tuple[Any, ...]:

@@ -1,0 +1,313 @@
+"""The environment loop: composer's contract with a lean step, addressable scenarios, kept renderer.
+
+What differs from ``composer.Environment``, and why:
+
+* the substep loop runs on MuJoCo's raw pointers, three times faster than composer's;
+* a forbidden contact in *any* physics substep is latched and ends the step: a tool tip can move
+  12 cm in a control step, so looking only at its end would miss it;
+* each substep ends with ``mj_step1``, so that poses, contacts and pictures belong to the same joint
+  positions;
+* time is counted in whole control steps;
+* nothing is drawn before the first ``reset``, so that processes may fork until then.
+"""
+
+import abc
+import weakref
+from typing import Any, Self
+
+import dm_env
+import mujoco
+import numpy as np
+import numpy.typing as npt
+from dm_control import composer, mjcf
+from dm_env import specs
+
+from hvs_suite.cell.renderer import Renderer
+from hvs_suite.errors import ScenarioError
+
+FloatArray = npt.NDArray[np.float64]
+Observation = dict[str, npt.NDArray[Any]]
+
+
+class ServoTask(composer.Task, abc.ABC):
+    """What the environment asks of a task, beyond composer's own contract.
+
+    Attributes:
+        time_limit_steps: Control steps after which an episode is truncated.
+        camera_side: Side of the largest picture that the task observes (px).
+        multisampling: Samples per pixel.
+        environment: The environment that plays the task, set by it.
+    """
+
+    time_limit_steps: int
+    camera_side: int
+    multisampling: int
+    environment: "Environment"
+
+    @abc.abstractmethod
+    def prepare(self, index: int) -> None:
+        """Draw scenario ``index``; called before composer's ``initialize_episode``."""
+
+    @abc.abstractmethod
+    def seeded_index(self, seed: int, count: int) -> int:
+        """Scenario that the ``count``-th reset after ``reset(seed=seed)`` plays."""
+
+    @abc.abstractmethod
+    def is_forbidden(self, physics: mjcf.Physics) -> bool:
+        """Whether a contact that exists now must never happen; asked after every substep."""
+
+    @abc.abstractmethod
+    def finish_step(self, physics: mjcf.Physics, *, collided: bool, at_time_limit: bool) -> None:
+        """Compute errors, success and the ends of the episode at the end of a control step."""
+
+    @abc.abstractmethod
+    def textures_to_upload(self) -> tuple[int, ...]:
+        """Ids of the textures that the last ``initialize_episode`` repainted."""
+
+    @property
+    @abc.abstractmethod
+    def has_ended(self) -> bool:
+        """Whether the last control step ended the episode."""
+
+
+class Environment(composer.Environment):
+    """A ``composer.Environment`` whose episodes are scenarios with an index.
+
+    Attributes:
+        clip_actions: Clip and count action values outside [-1, 1] instead of refusing them.
+
+    Args:
+        task: The task.
+        seed: Start of the stream that bare ``reset()`` calls walk; None draws one.
+    """
+
+    def __init__(self, task: ServoTask, seed: int | None = None) -> None:
+        self.clip_actions = False
+        self._physics: Any = None
+        self._renderer: Renderer | None = None
+        self._studio: dict[int, Renderer] = {}
+        self._control_steps = 0
+        self._seed = (
+            int(np.random.SeedSequence().generate_state(1, np.uint32)[0]) if seed is None else seed
+        )
+        self._count = 0
+        super().__init__(
+            task, recompile_mjcf_every_episode=False, legacy_step=False, random_state=0
+        )
+        self._mjcf_never_compiled = False
+
+    # --- dm_env ---------------------------------------------------------------------------------
+
+    def reset(self, *, scenario: int | None = None, seed: int | None = None) -> dm_env.TimeStep:
+        """Start an episode.
+
+        Args:
+            scenario: Index of the scenario to play; leaves the stream of bare resets alone.
+            seed: Play scenario ``seed`` (mod 1,000 on ``test``) and start a new stream from it.
+
+        Returns:
+            The first time step.
+
+        Raises:
+            ScenarioError: The index or seed is negative, not whole or beyond the split.
+        """
+        if scenario is None:
+            if seed is not None:
+                if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+                    raise ScenarioError(f"a seed is a whole number from 0 up, not {seed!r}")
+                self._seed, self._count = int(seed), 0
+            scenario = self.task.seeded_index(self._seed, self._count)
+            self._count += 1
+        self.task.prepare(scenario)
+        self._control_steps = 0
+        with self._physics.reset_context():
+            self._hooks.initialize_episode(self._physics_proxy, self._random_state)
+        data = self._physics.data.ptr
+        mujoco.mj_step1(self._physics.model.ptr, data)
+        self._upload_textures()
+        self._reset_next_step = False
+        return dm_env.restart(self._observe())
+
+    def step(self, action: npt.ArrayLike) -> dm_env.TimeStep:
+        """Run one control step.
+
+        Args:
+            action: As in ``action_spec``.
+
+        Returns:
+            The time step; after the last of an episode this starts the next one, as in dm_env.
+
+        Raises:
+            ActionError: The action has NaN, infinity, a wrong shape, or leaves [-1, 1].
+        """
+        if self._reset_next_step:
+            return self.reset()
+        physics = self._physics_proxy
+        self._hooks.before_step(physics, action, self._random_state)
+        model, data = self._physics.model.ptr, self._physics.data.ptr
+        task = self.task
+        collided = False
+        for _ in range(self._n_sub_steps):
+            mujoco.mj_step2(model, data)
+            mujoco.mj_step1(model, data)
+            if data.ncon and task.is_forbidden(physics):
+                collided = True
+                break
+        self._control_steps += 1
+        task.finish_step(
+            physics,
+            collided=collided,
+            at_time_limit=self._control_steps >= task.time_limit_steps,
+        )
+        self._hooks.after_step(physics, self._random_state)
+        reward = task.get_reward(physics)
+        discount = task.get_discount(physics)
+        self._reset_next_step = task.has_ended
+        kind = dm_env.StepType.LAST if task.has_ended else dm_env.StepType.MID
+        return dm_env.TimeStep(kind, reward, discount, self._observe())
+
+    def observation_spec(self) -> dict[str, specs.Array]:
+        """Shapes, types and bounds of the observations, known without drawing anything."""
+        return {
+            name: item.array_spec.replace(name=name)
+            for name, item in self.task.observables.items()
+            if item.enabled
+        }
+
+    def action_spec(self) -> specs.BoundedArray:
+        """Seven (or six) numbers in [-1, 1]."""
+        spec: specs.BoundedArray = self.task.action_spec(self._physics_proxy)
+        return spec
+
+    def close(self) -> None:
+        """Free renderers and physics; calling it again does nothing."""
+        for renderer in (self._renderer, *self._studio.values()):
+            if renderer is not None:
+                renderer.close()
+        self._renderer = None
+        self._studio = {}
+        if self._physics is not None:
+            self._physics.free()
+            self._physics = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    # --- what the suite adds --------------------------------------------------------------------
+
+    @property
+    def control_steps(self) -> int:
+        """Control steps since the last reset."""
+        return self._control_steps
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """Outcome so far; keys as in ``Align.info``, and ``steps``."""
+        return {**self.task.info(), "steps": self._control_steps}
+
+    @property
+    def variant(self) -> Any:
+        """The task's parameters."""
+        return self.task.variant
+
+    @property
+    def split(self) -> str:
+        """Name of the stream of scenarios."""
+        return str(self.task.source.split)
+
+    @property
+    def scenario(self) -> Any:
+        """The scenario being played."""
+        return self.task.scenario
+
+    @property
+    def joint_positions(self) -> FloatArray:
+        """True joint angles, (7,) rad."""
+        positions: FloatArray = self.task.joint_positions(self._physics_proxy)
+        return positions
+
+    @property
+    def joint_velocities(self) -> FloatArray:
+        """True joint speeds, (7,) rad/s."""
+        velocities: FloatArray = self.task.joint_velocities(self._physics_proxy)
+        return velocities
+
+    @property
+    def setpoint(self) -> FloatArray:
+        """True joint set point that the controller tracks now, (7,) rad."""
+        setpoint: FloatArray = self.task.setpoint(self._physics_proxy)
+        return setpoint
+
+    @property
+    def pending_setpoints(self) -> list[FloatArray]:
+        """True set points that were commanded and still wait out the latency, oldest first."""
+        return list(self.task.pending_setpoints())
+
+    def commandable(self, q: npt.ArrayLike) -> npt.NDArray[np.float32]:
+        """The ``joint_position`` action that sends the arm to true joint angles (7,) rad."""
+        action: npt.NDArray[np.float32] = self.task.commandable(q)
+        return action
+
+    def privileged(self) -> dict[str, FloatArray]:
+        """What only training and the expert may see; keys as in ``Align.privileged``."""
+        values: dict[str, FloatArray] = self.task.privileged(self._physics_proxy)
+        return values
+
+    @property
+    def renderer(self) -> Renderer:
+        """The kept renderer of the task's own cameras, made when first asked for."""
+        if self._renderer is None:
+            self._renderer = Renderer(
+                self._physics.model.ptr, self.task.camera_side, self.task.multisampling
+            )
+            self._upload_textures()
+        return self._renderer
+
+    def render(
+        self, width: int = 480, height: int = 480, camera: str = "cell"
+    ) -> npt.NDArray[np.uint8]:
+        """Draw a picture for people, with shadows and smooth edges.
+
+        Args:
+            width: Columns (px).
+            height: Rows (px).
+            camera: ``cell`` for a third-person view, or ``eih`` or ``eth``.
+
+        Returns:
+            RGB, uint8 (H, W, 3).
+        """
+        side = max(width, height)
+        if side not in self._studio:
+            renderer = Renderer(self._physics.model.ptr, side, 4, studio=True)
+            self._studio[side] = renderer
+            for texture in self.task.textures_to_upload():
+                renderer.upload_texture(texture)
+        view = self.task.view(self._physics_proxy, camera)
+        return self._studio[side].colour(self._physics.data.ptr, view, height, width)
+
+    def _observe(self) -> Observation:
+        physics, random_state = self._physics_proxy, self._random_state
+        return {
+            name: item(physics, random_state)
+            for name, item in self.task.observables.items()
+            if item.enabled
+        }
+
+    def _upload_textures(self) -> None:
+        for renderer in (self._renderer, *self._studio.values()):
+            if renderer is not None:
+                for texture in self.task.textures_to_upload():
+                    renderer.upload_texture(texture)
+
+    def _recompile_physics_and_update_observables(self) -> None:
+        # Composer draws every camera here, once before the first reset; we must not (see above).
+        self._physics_proxy = None
+        self._recompile_physics()
+        self._physics_proxy = weakref.proxy(self._physics)
+        self._n_sub_steps = self._task.physics_steps_per_control_step
+        self._hooks.refresh_entity_hooks()
+        self._hooks.after_compile(self._physics_proxy, self._random_state)
+        self.task.environment = weakref.proxy(self)

@@ -1,0 +1,178 @@
+"""One kept OpenGL context, scene and set of buffers for all pictures of a model.
+
+dm_control's stock camera observable builds a new scene for every frame, and ``Physics.render``
+changes contexts; together they cost several times what drawing the picture does. A ``Renderer``
+keeps everything and hands out copies.
+"""
+
+import weakref
+from typing import Any
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from hvs_suite.cell import gl
+from hvs_suite.errors import RenderError
+
+# Collision capsules live in group 3 and are never drawn.
+_HIDDEN_GROUP = 3
+_MAX_GEOMS = 256
+
+
+class Renderer:
+    """Draws one model offscreen; made when the first picture is asked for.
+
+    Args:
+        model: Compiled model; its textures and meshes are uploaded once.
+        max_side: Side of the largest picture that will be asked for (px).
+        multisampling: Samples per pixel, 0 for none.
+        studio: Shadows and reflections for people; observations go without (three times faster).
+
+    Raises:
+        RenderError: No OpenGL backend works on this machine.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, max_side: int, multisampling: int, *, studio: bool = False
+    ) -> None:
+        self._model = model
+        self._gl = gl.create_context(max_side, max_side)
+        # MjrContext takes its sizes from the model; these are the only fields it reads from there.
+        model.vis.global_.offwidth = max_side
+        model.vis.global_.offheight = max_side
+        model.vis.quality.offsamples = multisampling
+        model.vis.quality.shadowsize = 2048 if studio else 0
+        try:
+            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        except mujoco.FatalError as error:
+            raise RenderError(f"MuJoCo could not set up OpenGL: {error}") from error
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR.value
+        self._scene = mujoco.MjvScene(model, _MAX_GEOMS)
+        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            self._scene.flags[flag] = studio
+        self._option = mujoco.MjvOption()
+        self._option.geomgroup[_HIDDEN_GROUP] = 0
+        self._option.sitegroup[:] = 0
+        self._perturbation = mujoco.MjvPerturb()
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
+        self._buffers: dict[tuple[int, int, str], npt.NDArray[Any]] = {}
+        # Runs at the latest before the interpreter takes EGL down, which is silent only then.
+        self._free = weakref.finalize(self, _free, self._gl, self._context)
+
+    def colour(
+        self, data: mujoco.MjData, camera: int | mujoco.MjvCamera, height: int, width: int
+    ) -> npt.NDArray[np.uint8]:
+        """Draw a camera's picture.
+
+        Args:
+            data: State to draw; poses must be up to date (``mj_step1`` or ``mj_forward``).
+            camera: Camera id in the model, or a free camera.
+            height: Rows of the picture (px).
+            width: Columns of the picture (px).
+
+        Returns:
+            RGB picture, uint8 (H, W, 3), row 0 on top; the caller owns it.
+        """
+        rect = self._draw(data, camera, height, width)
+        buffer = self._buffer(height, width, "colour")
+        mujoco.mjr_readPixels(buffer, None, rect, self._context)
+        return buffer[::-1].copy()
+
+    def depth(
+        self, data: mujoco.MjData, camera: int | mujoco.MjvCamera, height: int, width: int
+    ) -> npt.NDArray[np.float32]:
+        """Measure the distance along the optical axis.
+
+        Takes the arguments of ``colour``.
+
+        Returns:
+            Depth in metres, float32 (H, W, 1), capped at the far plane.
+        """
+        rect = self._draw(data, camera, height, width)
+        buffer = self._buffer(height, width, "depth")
+        mujoco.mjr_readPixels(None, buffer, rect, self._context)
+        extent = self._model.stat.extent
+        near = self._model.vis.map.znear * extent
+        far = self._model.vis.map.zfar * extent
+        # With the far plane at 0 the stored value is near / (far - near) * (far / z - 1).
+        metres = near * far / (near + buffer * (far - near))
+        return np.ascontiguousarray(metres[::-1, :, None], dtype=np.float32)
+
+    def segmentation(
+        self, data: mujoco.MjData, camera: int, height: int, width: int
+    ) -> npt.NDArray[np.int32]:
+        """Tell which geom each pixel shows.
+
+        Takes the arguments of ``colour``; multisampling must be off, or ids are blended.
+
+        Returns:
+            Geom ids, int32 (H, W), -1 where there is none.
+        """
+        flags = self._scene.flags
+        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = True
+        flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = True
+        try:
+            picture = self.colour(data, camera, height, width).astype(np.int32)
+        finally:
+            flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = False
+            flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = False
+        ids = picture[..., 0] + (picture[..., 1] << 8) + (picture[..., 2] << 16)
+        lookup = np.full(_MAX_GEOMS + 1, -1, np.int32)
+        for geom in self._scene.geoms[: self._scene.ngeom]:
+            if geom.segid != -1 and geom.objtype == mujoco.mjtObj.mjOBJ_GEOM.value:
+                lookup[geom.segid + 1] = geom.objid
+        return lookup[ids]
+
+    def upload_texture(self, texture: int) -> None:
+        """Send a changed texture of the model to the graphics library."""
+        self._make_current()
+        mujoco.mjr_uploadTexture(self._model, self._context, texture)
+
+    def close(self) -> None:
+        """Free the context; calling it again does nothing."""
+        self._free()
+
+    def _draw(
+        self, data: mujoco.MjData, camera: int | mujoco.MjvCamera, height: int, width: int
+    ) -> mujoco.MjrRect:
+        self._make_current()
+        if isinstance(camera, int):
+            self._camera.fixedcamid = camera
+            camera = self._camera
+        mujoco.mjv_updateScene(
+            self._model,
+            data,
+            self._option,
+            self._perturbation,
+            camera,
+            mujoco.mjtCatBit.mjCAT_ALL.value,
+            self._scene,
+        )
+        rect = mujoco.MjrRect(0, 0, width, height)
+        mujoco.mjr_render(rect, self._scene, self._context)
+        return rect
+
+    def _make_current(self) -> None:
+        if not self._free.alive:
+            raise RenderError("the renderer was closed; make a new environment")
+        # Other environments in this process may have made theirs current since.
+        self._gl.make_current()
+
+    def _buffer(self, height: int, width: int, kind: str) -> npt.NDArray[Any]:
+        key = (height, width, kind)
+        if key not in self._buffers:
+            self._buffers[key] = (
+                np.empty((height, width, 3), np.uint8)
+                if kind == "colour"
+                else np.empty((height, width), np.float32)
+            )
+        return self._buffers[key]
+
+
+def _free(context: gl.GLContext, mujoco_context: mujoco.MjrContext) -> None:
+    context.make_current()
+    mujoco_context.free()
+    context.free()

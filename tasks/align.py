@@ -1,0 +1,448 @@
+"""``align``: hold the flange over a target, facing it, at a set distance, within tolerance.
+
+The thesis task with its defects removed, and the scene and scoring of all six named variants.
+"""
+
+import math
+from typing import Any
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+from dm_control import composer, mjcf
+from dm_env import specs
+
+from hvs_suite.cell import cameras
+from hvs_suite.cell.arena import Cell
+from hvs_suite.cell.environment import ServoTask
+from hvs_suite.cell.kinematics import kinematics, tool_frame
+from hvs_suite.cell.marker import HALF_THICKNESS_M
+from hvs_suite.cell.robot import (
+    JOINT_ACCELERATION_RAD_S2,
+    JOINT_RANGE_RAD,
+    JOINT_SPEED_RAD_S,
+    SHELL_GROUP,
+)
+from hvs_suite.tasks import actions, appearance, observations, rewards
+from hvs_suite.tasks.scenario import Scenario, ScenarioSource
+from hvs_suite.tasks.variants import AlignVariant
+
+FloatArray = npt.NDArray[np.float64]
+
+# A ray that ends this close to the target's centre met the target, not something before it.
+_RAY_SLACK_M = 0.003
+
+
+class Align(ServoTask):
+    """The task; one object plays any scenario of its split.
+
+    Args:
+        variant: All parameters.
+        split: Name of the stream of scenarios.
+    """
+
+    def __init__(self, variant: AlignVariant, split: str = "train") -> None:
+        self.variant = variant
+        self._cell = Cell(
+            surface=variant.surface,
+            surface_size_m=variant.surface_size_m,
+            marker=variant.marker,
+            target_diameter_m=variant.target_diameter_m,
+            eih_fov_deg=variant.eih_fov_deg,
+            eth_fov_deg=variant.eth_fov_deg,
+            eth_position_m=variant.eth_position_m,
+            eth_look_at_m=variant.eth_look_at_m,
+        )
+        self.source = ScenarioSource(variant, split, self._cell.surface)
+        self.time_limit_steps = variant.time_limit_steps
+        self.camera_side = max(variant.eih_resolution, variant.eth_resolution)
+        self.multisampling = variant.multisampling
+        self.set_timesteps(
+            control_timestep=variant.control_period_s,
+            physics_timestep=self._cell.mjcf_model.option.timestep,
+        )
+        self._observables = observations.make_observables(self)
+        self._scenario: Scenario | None = None
+        self._goal_configurations: FloatArray | None = None
+        self._errors: dict[str, float] = {}
+        self._reward_terms: dict[str, float] = {}
+        self._n_inside = 0
+        self._inside_once = False
+        self._clear_outcome()
+
+    # --- composer -------------------------------------------------------------------------------
+
+    @property
+    def root_entity(self) -> composer.Entity:
+        """The cell."""
+        return self._cell
+
+    @property
+    def observables(self) -> dict[str, Any]:
+        """Observables by name: exactly the variant's observations, all enabled."""
+        return self._observables
+
+    def after_compile(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
+        """Look up indices in the compiled model once."""
+        del random_state
+        cell, variant = self._cell, self.variant
+        robot = cell.robot
+        joints = physics.bind(robot.joints)
+        self._qpos = np.array(joints.qposadr, int).ravel()
+        self._qvel = np.array(joints.dofadr, int).ravel()
+        self._actuators = np.array(physics.bind(robot.actuators).element_id, int).ravel()
+        self._act = physics.model.actuator_actadr[self._actuators].copy()
+        self._flange = int(physics.bind(robot.flange).element_id)
+        self._flange_body = int(physics.bind(robot.flange_body).element_id)
+        self._marker_geom = int(physics.bind(cell.marker.geom).element_id)
+        self._mocap = int(physics.model.body_mocapid[physics.model.geom_bodyid[self._marker_geom]])
+        self.cameras = {
+            "eih": cameras.Camera(
+                "eih",
+                int(physics.bind(cell.eih).element_id),
+                variant.eih_resolution,
+                variant.eih_channels,
+                variant.eih_fov_deg,
+            ),
+            "eth": cameras.Camera(
+                "eth",
+                int(physics.bind(cell.eth).element_id),
+                variant.eth_resolution,
+                variant.eth_channels,
+                variant.eth_fov_deg,
+            ),
+        }
+        self._appearance = appearance.Appearance(physics, cell)
+        self._rays = np.zeros(mujoco.mjNGROUP, np.uint8)
+        self._rays[: SHELL_GROUP + 1] = 1
+
+    def prepare(self, index: int) -> None:
+        """Draw scenario ``index``."""
+        self._scenario = self.source.draw(index)
+
+    def seeded_index(self, seed: int, count: int) -> int:
+        """As in ``ScenarioSource.seeded_index``."""
+        return self.source.seeded_index(seed, count)
+
+    def initialize_episode(
+        self, physics: mjcf.Physics, random_state: np.random.RandomState
+    ) -> None:
+        """Set the state and the look of the drawn scenario; nothing of earlier ones remains."""
+        del random_state
+        scenario = self.scenario
+        data = physics.data.ptr
+        data.qpos[self._qpos] = scenario.start
+        # The set point starts where the arm is: MuJoCo's default of 0 would throw it.
+        data.act[self._act] = scenario.start
+        data.mocap_pos[self._mocap] = scenario.target
+        data.mocap_quat[self._mocap] = _marker_orientation(scenario.normal)
+        self._appearance.apply(physics, scenario)
+        self.goal = scenario.target + scenario.normal * self.variant.standoff_m
+        start = scenario.start + scenario.joint_offset
+        self._queue = [start.copy() for _ in range(self.variant.latency_steps)]
+        self._commanded = start
+        self._speed = np.zeros(len(start))
+        self._clear_outcome()
+        self._goal_configurations = None
+        if "joint_space" in self.variant.rewards:
+            self._goal_configurations = kinematics().goal_configurations(self.goal, scenario.normal)
+        mujoco.mj_kinematics(physics.model.ptr, data)
+        self._measure(physics)
+
+    def before_step(
+        self, physics: mjcf.Physics, action: Any, random_state: np.random.RandomState
+    ) -> None:
+        """Turn the action into the speed of the set point for this control step."""
+        del random_state
+        variant = self.variant
+        values, clipped = actions.check_action(
+            action, variant.action_mode, clip=self.environment.clip_actions
+        )
+        self._n_clipped += clipped
+        self._commanded = actions.set_point(
+            values, variant.action_mode, self._commanded, variant.control_period_s
+        )
+        self._queue.append(self._commanded)
+        data = physics.data.ptr
+        true_target = self._queue.pop(0) - self.scenario.joint_offset
+        distance = true_target - data.act[self._act]
+        speed = distance / variant.control_period_s
+        if variant.acceleration_limits:
+            speed = _accelerate(self._speed, distance, variant.control_period_s)
+        self._speed = np.clip(speed, -JOINT_SPEED_RAD_S, JOINT_SPEED_RAD_S)
+        data.ctrl[self._actuators] = self._speed
+
+    def is_forbidden(self, physics: mjcf.Physics) -> bool:
+        """The flange never touches anything in this task: every contact is forbidden."""
+        return bool(physics.data.ptr.ncon)
+
+    def finish_step(self, physics: mjcf.Physics, *, collided: bool, at_time_limit: bool) -> None:
+        """Measure errors, count the hold, decide success, collision and truncation."""
+        self._steps += 1
+        self._measure(physics)
+        inside = self.is_inside and not collided
+        self._n_inside = self._n_inside + 1 if inside else 0
+        self._inside_once = self._inside_once or inside
+        self._collision = collided
+        self._success = self._n_inside >= self.variant.hold_steps
+        self._truncated = at_time_limit and not (self._success or self._collision)
+
+        self._reward_terms = rewards.reward_terms(
+            self.variant,
+            rewards.StepOutcome(
+                success=self._success,
+                collision=self._collision,
+                truncated=self._truncated,
+                distance_m=self._errors["position_error_mm"] / 1000.0,
+                tilt_deg=self._errors["tilt_error_deg"],
+                joint_distance=None
+                if self._goal_configurations is None
+                else rewards.joint_distance(
+                    self.joint_positions(physics), self._goal_configurations
+                ),
+            ),
+        )
+
+    def get_reward(self, physics: mjcf.Physics) -> float:
+        """Sum of the reward terms of the last control step."""
+        del physics
+        return float(sum(self._reward_terms.values()))
+
+    def get_discount(self, physics: mjcf.Physics) -> float:
+        """0 after goal or collision; truncation is no end of the world and keeps the discount."""
+        del physics
+        return 0.0 if self._success or self._collision else self.variant.discount
+
+    @property
+    def has_ended(self) -> bool:
+        """Goal, collision or time limit."""
+        return self._success or self._collision or self._truncated
+
+    def should_terminate_episode(self, physics: mjcf.Physics) -> bool:
+        """Goal or collision; the time limit is the environment's."""
+        del physics
+        return self._success or self._collision
+
+    def action_spec(self, physics: mjcf.Physics) -> specs.BoundedArray:
+        """Numbers in [-1, 1]; meaning in ``actions.set_point``."""
+        del physics
+        return actions.action_spec(self.variant.action_mode)
+
+    def textures_to_upload(self) -> tuple[int, ...]:
+        """The surface's texture, where the variant repaints it."""
+        return self._appearance.changed_textures
+
+    # --- what people ask ------------------------------------------------------------------------
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario being played."""
+        if self._scenario is None:
+            raise RuntimeError("reset the environment first")
+        return self._scenario
+
+    @property
+    def steps(self) -> int:
+        """Control steps since the reset."""
+        return self._steps
+
+    @property
+    def is_inside(self) -> bool:
+        """Whether all errors lie within the tolerances now."""
+        bounds = (
+            (self.variant.position_tolerance_mm, "position_error_mm"),
+            (self.variant.lateral_tolerance_mm, "lateral_error_mm"),
+            (self.variant.height_tolerance_mm, "height_error_mm"),
+            (self.variant.tilt_tolerance_deg, "tilt_error_deg"),
+        )
+        return all(abs(self._errors[name]) <= bound for bound, name in bounds if bound is not None)
+
+    @property
+    def reward_terms(self) -> dict[str, float]:
+        """Reward terms of the last control step by name."""
+        return dict(self._reward_terms)
+
+    def info(self) -> dict[str, Any]:
+        """Outcome so far.
+
+        Returns:
+            ``task`` and ``split`` (str), ``scenario`` (int), ``is_success``, ``success_once``
+            (inside tolerance at any control step's end), ``collision``, ``truncated`` (bool),
+            ``n_inside`` (control steps held so far), ``n_clipped`` (actions clipped) and
+            ``position_error_mm``, ``lateral_error_mm``, ``height_error_mm`` (absolute),
+            ``tilt_error_deg`` at the end of the last control step.
+        """
+        return {
+            "task": self.variant.name,
+            "split": self.source.split,
+            "scenario": self.scenario.index,
+            "is_success": self._success,
+            "success_once": self._inside_once,
+            "collision": self._collision,
+            "truncated": self._truncated,
+            "n_inside": self._n_inside,
+            "n_clipped": self._n_clipped,
+            **{name: abs(value) for name, value in self._errors.items()},
+        }
+
+    def privileged(self, physics: mjcf.Physics) -> dict[str, FloatArray]:
+        """What only training and the expert may see.
+
+        Returns:
+            ``joint_positions`` (7,) true, rad; ``joint_offset`` (7,) rad; ``goal_position`` (3,) m,
+            of the flange; ``goal_normal`` (3,); ``target_position`` (3,) m; ``target_eih`` and
+            ``target_eth`` (4,): u, v of the target's centre in [-1, 1] over the image (x right, y
+            down), apparent diameter in image widths, and 1 where it can be seen, else 0 (u, v and
+            diameter are then 0).
+        """
+        scenario = self.scenario
+        return {
+            "joint_positions": self.joint_positions(physics),
+            "joint_offset": scenario.joint_offset.copy(),
+            "goal_position": self.goal.copy(),
+            "goal_normal": scenario.normal.copy(),
+            "target_position": scenario.target.copy(),
+            "target_eih": self.target_in_image(physics, "eih"),
+            "target_eth": self.target_in_image(physics, "eth"),
+        }
+
+    def target_in_image(self, physics: mjcf.Physics, name: str) -> FloatArray:
+        """Where the target appears in a camera; see ``privileged``."""
+        camera = self.cameras[name]
+        data = physics.data.ptr
+        scenario = self.scenario
+        centre = scenario.target + scenario.normal * 2.0 * HALF_THICKNESS_M
+        u, v, depth = cameras.project(centre, camera.K, camera.T(data))
+        # Pixel centres are whole, so the image spans from -1/2 to resolution - 1/2.
+        x = 2.0 * (u + 0.5) / camera.resolution - 1.0
+        y = 2.0 * (v + 0.5) / camera.resolution - 1.0
+        eye = data.cam_xpos[camera.id]
+        seen = depth > 0 and max(abs(x), abs(y)) <= 1.0 and (eye - centre) @ scenario.normal > 0
+        if not seen or self._is_occluded(physics, eye, centre, own=name == "eih"):
+            return np.zeros(4)
+        diameter = camera.K[0, 0] * self.variant.target_diameter_m / depth / camera.resolution
+        return np.array([x, y, diameter, 1.0])
+
+    def joint_positions(self, physics: mjcf.Physics) -> FloatArray:
+        """True joint angles, (7,) rad."""
+        return physics.data.ptr.qpos[self._qpos].copy()
+
+    def joint_velocities(self, physics: mjcf.Physics) -> FloatArray:
+        """True joint speeds, (7,) rad/s."""
+        return physics.data.ptr.qvel[self._qvel].copy()
+
+    def flange_position(self, physics: mjcf.Physics) -> FloatArray:
+        """True position of the flange face's centre, (3,) m, base frame."""
+        return physics.data.ptr.site_xpos[self._flange].copy()
+
+    def measured_positions(self, physics: mjcf.Physics) -> FloatArray:
+        """Joint angles as the encoders show them, (7,) rad."""
+        return self.joint_positions(physics) + self.scenario.joint_offset
+
+    def setpoint(self, physics: mjcf.Physics) -> FloatArray:
+        """True joint set point that the controller tracks now, (7,) rad."""
+        return physics.data.ptr.act[self._act].copy()
+
+    def setpoint_velocity(self) -> FloatArray:
+        """Speed of the set point in the last control step, (7,) rad/s."""
+        return self._speed.copy()
+
+    def pending_setpoints(self) -> list[FloatArray]:
+        """True set points that were commanded and still wait out the latency, oldest first."""
+        return [target - self.scenario.joint_offset for target in self._queue]
+
+    def commandable(self, q: npt.ArrayLike) -> npt.NDArray[np.float32]:
+        """The ``joint_position`` action that sends the arm to true joint angles.
+
+        Args:
+            q: True joint angles, (7,) rad.
+
+        Returns:
+            (7,) float32, clipped to [-1, 1].
+        """
+        encoder = np.asarray(q, np.float64) + self.scenario.joint_offset
+        return np.clip(encoder / JOINT_RANGE_RAD, -1.0, 1.0).astype(np.float32)
+
+    def view(self, physics: mjcf.Physics, camera: str) -> int | mujoco.MjvCamera:
+        """Camera for pictures: ``eih``, ``eth``, or ``cell`` for a third-person view."""
+        del physics
+        if camera in self.cameras:
+            return self.cameras[camera].id
+        view = mujoco.MjvCamera()
+        view.type = mujoco.mjtCamera.mjCAMERA_FREE.value
+        view.lookat[:] = [0.05, 0.0, 0.42]
+        view.distance, view.azimuth, view.elevation = 2.6, 145.0, -22.0
+        return view
+
+    def _measure(self, physics: mjcf.Physics) -> None:
+        data, scenario = physics.data.ptr, self.scenario
+        normal = scenario.normal
+        axis = data.site_xmat[self._flange].reshape(3, 3)[:, 2]
+        offset = data.site_xpos[self._flange] - scenario.target
+        along = float(offset @ normal)
+        height = along - self.variant.standoff_m
+        lateral = float(np.linalg.norm(offset - along * normal))
+        # atan2 keeps its precision for small angles, where arccos loses half the digits.
+        tilt = math.atan2(float(np.linalg.norm(np.cross(axis, normal))), float(-axis @ normal))
+        self._errors = {
+            "position_error_mm": 1000.0 * math.hypot(lateral, height),
+            "lateral_error_mm": 1000.0 * lateral,
+            "height_error_mm": 1000.0 * height,
+            "tilt_error_deg": math.degrees(tilt),
+        }
+
+    def _is_occluded(
+        self, physics: mjcf.Physics, eye: FloatArray, centre: FloatArray, *, own: bool
+    ) -> bool:
+        ray = centre - eye
+        hit = np.zeros(1, np.int32)
+        # The eye-in-hand camera sits in the flange: its own link must not count.
+        length = mujoco.mj_ray(
+            physics.model.ptr,
+            physics.data.ptr,
+            eye,
+            ray,
+            self._rays,
+            1,
+            self._flange_body if own else -1,
+            hit,
+        )
+        return bool(0.0 <= length < 1.0 - _RAY_SLACK_M / float(np.linalg.norm(ray)))
+
+    def _clear_outcome(self) -> None:
+        self._steps = 0
+        self._n_inside = 0
+        self._n_clipped = 0
+        self._inside_once = False
+        self._success = False
+        self._collision = False
+        self._truncated = False
+        self._reward_terms = {}
+
+
+def _accelerate(speed: FloatArray, distance: FloatArray, period_s: float) -> FloatArray:
+    """Next set-point speed under acceleration limits, able to stop at the target.
+
+    The largest v with v T + (braking distance from v in steps of a T) <= distance solves
+    v^2 / (2 a) + v T / 2 = distance.
+
+    Args:
+        speed: Speed of the last control step, (7,) rad/s.
+        distance: Way to the target, (7,) rad.
+        period_s: Control period T (s).
+
+    Returns:
+        Speed, (7,) rad/s.
+    """
+    a, change = JOINT_ACCELERATION_RAD_S2, JOINT_ACCELERATION_RAD_S2 * period_s
+    brake = a * period_s * (np.sqrt(0.25 + 2.0 * np.abs(distance) / (a * period_s**2)) - 0.5)
+    wanted = np.sign(distance) * np.minimum(brake, np.abs(distance) / period_s)
+    return np.clip(wanted, speed - change, speed + change)
+
+
+def _marker_orientation(normal: FloatArray) -> FloatArray:
+    """Quaternion that turns the marker's z axis to the normal."""
+    frame = tool_frame(-normal)
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, frame.ravel())
+    return quat

@@ -1,0 +1,143 @@
+"""Observation presets and the observables behind them.
+
+What a policy may see (``vision``) and what only training may see (``state``) are kept apart: no
+privileged value stands among the observations of a vision preset.
+"""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from dm_control import mjcf
+from dm_control.composer.observation import observable
+from dm_env import specs
+
+from hvs_suite.cell import cameras
+from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
+from hvs_suite.tasks.variants import observation_names
+
+if TYPE_CHECKING:
+    from hvs_suite.tasks.align import Align
+
+FloatArray = npt.NDArray[np.float64]
+
+POSITION_BOUND_RAD = JOINT_RANGE_RAD + 0.05
+"""Bound of measured joint angles: the range, the encoder's zero error and the stop's give."""
+SPEED_BOUND_RAD_S = 2.0 * JOINT_SPEED_RAD_S
+"""Bound of measured joint speeds; the arm overshoots its set point's speed when that jumps."""
+DEPTH_BOUND_M = 20.0
+_STATE_BOUND_M = 3.0
+# One bank of unit noise, cut into frames at random places, costs a tenth of drawing it anew.
+_NOISE_BANK = 1 << 20
+
+
+class VectorObservable(observable.Observable):
+    """Observable for a vector with known bounds."""
+
+    def __init__(
+        self, read: Callable[[mjcf.Physics], FloatArray], spec: specs.BoundedArray
+    ) -> None:
+        super().__init__(update_interval=1, buffer_size=1, delay=0, aggregator=None, corruptor=None)
+        self._read = read
+        self._spec = spec
+
+    @property
+    def array_spec(self) -> specs.BoundedArray:
+        """Shape, type and bounds."""
+        return self._spec
+
+    def _callable(self, physics: mjcf.Physics) -> Callable[[], npt.NDArray[Any]]:
+        return lambda: self._read(physics).astype(self._spec.dtype)
+
+
+def make_observables(task: "Align") -> dict[str, observable.Observable]:
+    """Build exactly the observables that the task's variant names, enabled.
+
+    Args:
+        task: The task they read from.
+
+    Returns:
+        Observables by name: ``eih``, ``eth`` uint8 (H, W, C); ``eih_depth``, ``eth_depth`` float32
+        (H, W, 1) m; ``joint_positions`` (7,) rad, ``joint_velocities`` (7,) rad/s, as measured;
+        privileged: ``flange_position``, ``goal_position`` (3,) m, ``goal_normal`` (3,). With
+        ``normalise_observation`` pictures are float32 in [0, 1] and joints in [-1, 1].
+    """
+    variant = task.variant
+    bank = _noise_bank(variant.image_noise) if variant.image_noise > 0 else None
+    built: dict[str, observable.Observable] = {}
+    for name in observation_names(variant.observations):
+        if name in ("eih", "eth"):
+            built[name] = _picture(task, name, bank)
+        elif name in ("eih_depth", "eth_depth"):
+            built[name] = _depth(task, name)
+        else:
+            built[name] = _vector(task, name)
+        built[name].enabled = True
+    return built
+
+
+def _picture(task: "Align", name: str, bank: npt.NDArray[np.int16] | None) -> Any:
+    variant = task.variant
+    side = variant.eih_resolution if name == "eih" else variant.eth_resolution
+    channels = variant.eih_channels if name == "eih" else variant.eth_channels
+    normalise = variant.normalise_observation
+
+    def take(physics: mjcf.Physics) -> npt.NDArray[Any]:
+        image = task.environment.renderer.colour(
+            physics.data.ptr, task.cameras[name].id, side, side
+        )
+        if bank is not None:
+            random = task.source.generator(f"noise-{name}", task.scenario.index, task.steps)
+            start = int(random.integers(bank.size - image.size))
+            noise = bank[start : start + image.size].reshape(image.shape)
+            image = np.clip(image + noise, 0, 255).astype(np.uint8)
+        if channels == 1:
+            image = cameras.to_grey(image)
+        return image.astype(np.float32) / np.float32(255) if normalise else image
+
+    shape = (side, side, channels)
+    spec = (
+        specs.BoundedArray(shape, np.float32, 0.0, 1.0)
+        if normalise
+        else specs.BoundedArray(shape, np.uint8, 0, 255)
+    )
+    return cameras.CameraImage(take, spec)
+
+
+def _depth(task: "Align", name: str) -> Any:
+    camera = name.removesuffix("_depth")
+    side = task.variant.eih_resolution if camera == "eih" else task.variant.eth_resolution
+
+    def take(physics: mjcf.Physics) -> npt.NDArray[Any]:
+        return task.environment.renderer.depth(
+            physics.data.ptr, task.cameras[camera].id, side, side
+        )
+
+    return cameras.CameraImage(
+        take, specs.BoundedArray((side, side, 1), np.float32, 0.0, DEPTH_BOUND_M)
+    )
+
+
+def _vector(task: "Align", name: str) -> VectorObservable:
+    reads: dict[str, tuple[Callable[[mjcf.Physics], FloatArray], FloatArray]] = {
+        "joint_positions": (task.measured_positions, POSITION_BOUND_RAD),
+        "joint_velocities": (task.joint_velocities, SPEED_BOUND_RAD_S),
+        "flange_position": (task.flange_position, np.full(3, _STATE_BOUND_M)),
+        "goal_position": (lambda physics: task.goal, np.full(3, _STATE_BOUND_M)),
+        "goal_normal": (lambda physics: task.scenario.normal, np.ones(3)),
+    }
+    read, bound = reads[name]
+    if task.variant.normalise_observation and name.startswith("joint_"):
+        scale = JOINT_RANGE_RAD if name == "joint_positions" else JOINT_SPEED_RAD_S
+
+        def normalised(physics: mjcf.Physics) -> FloatArray:
+            return np.clip(read(physics) / scale, -1.0, 1.0)
+
+        return VectorObservable(normalised, specs.BoundedArray((7,), np.float32, -1.0, 1.0))
+    return VectorObservable(read, specs.BoundedArray(bound.shape, np.float64, -bound, bound))
+
+
+def _noise_bank(sigma: float) -> npt.NDArray[np.int16]:
+    random = np.random.Generator(np.random.Philox(key=0))
+    return np.rint(random.normal(size=_NOISE_BANK) * sigma).astype(np.int16)
