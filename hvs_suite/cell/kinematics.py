@@ -150,7 +150,7 @@ class Kinematics:
         """Rotation (3, 3) and position (3,) in m of the flange in the base frame."""
         pin.forwardKinematics(self.model, self._data, np.asarray(q, dtype=np.float64))
         placement = pin.updateFramePlacement(self.model, self._data, self._flange)
-        return placement.rotation.copy(), placement.translation.copy()
+        return np.array(placement.rotation), np.array(placement.translation)
 
     def jacobian(self, q: npt.ArrayLike) -> FloatArray:
         """Jacobian (6, 7) of the flange: linear (m/rad) over angular rows, in base axes."""
@@ -167,7 +167,7 @@ class Kinematics:
     def mass_matrix(self, q: npt.ArrayLike) -> FloatArray:
         """Joint-space mass matrix (7, 7) in kg m^2, rotor inertia included."""
         M = pin.crba(self.model, self._data, np.asarray(q, dtype=np.float64))
-        return np.triu(M) + np.triu(M, 1).T
+        return np.asarray(np.triu(M) + np.triu(M, 1).T)
 
     def gravity_torques(self, q: npt.ArrayLike) -> FloatArray:
         """Torques (7,) in Nm that hold the arm still against gravity."""
