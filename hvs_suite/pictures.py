@@ -34,8 +34,8 @@ CELL_SIDE = 576
 PANEL_WIDTH = 448
 MARGIN = 16
 CAMERA_SIDE = (PANEL_WIDTH - 3 * MARGIN) // 2
-BAR_LEFT, BAR_WIDTH, BAR_HEIGHT = MARGIN + 32, 272, 8
-ROW_HEIGHT = 21
+BAR_LEFT, BAR_WIDTH, BAR_HEIGHT = MARGIN + 32, 304, 9
+ROW_HEIGHT = 25
 
 PAPER, INK, FAINT, TRACK = (250, 250, 248), (30, 32, 36), (110, 114, 120), (226, 227, 224)
 ORANGE, GREEN, RED = (233, 98, 10), (22, 128, 60), (190, 30, 30)
@@ -219,11 +219,11 @@ def _draw_joints(draw: "ImageDraw", joints: npt.NDArray[np.float64], top: int) -
         middle = BAR_LEFT + BAR_WIDTH // 2
         at = middle + round(float(np.clip(angle / limit, -1.0, 1.0)) * BAR_WIDTH / 2)
         bar_top = y + (ROW_HEIGHT - BAR_HEIGHT) // 2 - 2
-        draw.text((MARGIN, y), name, INK, font(13, bold=True))
+        draw.text((MARGIN, y), name, INK, font(14, bold=True))
         draw.rectangle((BAR_LEFT, bar_top, BAR_LEFT + BAR_WIDTH, bar_top + BAR_HEIGHT), TRACK)
         draw.rectangle((min(middle, at), bar_top, max(middle, at), bar_top + BAR_HEIGHT), ORANGE)
         draw.text(
-            (PANEL_WIDTH - MARGIN, y), f"{np.degrees(angle):+.1f}°", INK, font(13), anchor="ra"
+            (PANEL_WIDTH - MARGIN, y), f"{np.degrees(angle):+.1f}°", INK, font(14), anchor="ra"
         )
     return top + len(JOINT_NAMES) * ROW_HEIGHT + 6
 
@@ -261,9 +261,9 @@ def _draw_standing(
     )
     for row, (label, text, good) in enumerate(rows):
         y = top + row * ROW_HEIGHT
-        draw.text((MARGIN, y), label, FAINT, font(13))
+        draw.text((MARGIN, y), label, FAINT, font(14))
         colour = INK if good is None else (GREEN if good else RED)
-        draw.text((MARGIN + 80, y), text, colour, font(13))
+        draw.text((MARGIN + 80, y), text, colour, font(14))
     end = _ending(info)
     if end is not None:
         word, colour = end

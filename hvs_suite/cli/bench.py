@@ -48,7 +48,7 @@ class Bench:
             raise OptionError(f"--seconds must be above 0, not {self.seconds:g}")
         with hvs_suite.load(self.task) as env:
             figures = against_bare_loop(env, self.seconds)
-        with hvs_suite.load(self.task, observations="joint_positions+joint_velocities") as env:
+        with hvs_suite.load(self.task, observations="state") as env:
             steps, elapsed_s, _ = play(env, self.seconds / 2)
             figures["steps_per_s_no_cameras"] = steps / elapsed_s
         figures |= with_workers(self.task, self.seconds)
