@@ -1,0 +1,270 @@
+"""The scripted expert: the fastest way to the goal from wherever the arm is, every control step.
+
+It is privileged (it reads the true state and the goal), it keeps no memory of its own plan, and
+therefore answers the same for any policy that brought the arm to a state: what DAgger needs.
+
+A decision is:
+
+1. Predict the joints to the moment from which the action acts (variants with latency).
+2. Rank the goal's whole redundant family (elbow swivel, mirror shapes, free yaw) by the least
+   travel time from the present position and velocity under speed and acceleration limits.
+3. Take the first whose time-optimal motion (ruckig) keeps clear of surface and self.
+4. Command the point of that motion which the arm, trailing its set point, shall reach next.
+"""
+
+from __future__ import annotations
+
+import collections.abc
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import ruckig
+
+from hvs_suite.cell import robot
+from hvs_suite.cell.kinematics import Kinematics, kinematics
+from hvs_suite.errors import OptionError
+
+if TYPE_CHECKING:
+    from hvs_suite.cell.environment import Environment
+
+FloatArray = npt.NDArray[np.float64]
+
+CLEARANCE_M = 0.010
+"""Distance that a motion keeps from the surface and between links (m)."""
+N_SWIVEL = 360
+"""Elbow places in the ranked family; one degree apart costs under 10 ms of travel time."""
+PROJECTION_RANGE_M = 0.15
+"""Below this distance the nearest configuration of the goal is also computed exactly (m)."""
+TIE_BREAK_S = 0.01
+"""Price of unneeded motion: small against a control step, enough to make the choice unique."""
+
+_LAG_S = float(np.max(robot.DAMPING_NM_S_RAD / robot.STIFFNESS_NM_RAD))
+"""The joints trail a moving set point by kv / kp (s)."""
+_MAX_PATHS = 24
+_MAX_FLANGE_SPEED_M_S = 2.5
+_PATH_STEP_S = 0.02
+_DISTINCT_RAD = 0.2
+_ITERATIONS = 8
+
+
+def stopping_travel_time(
+    q: FloatArray, velocity: FloatArray, goals: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Least time to come to rest at each goal from a moving start, joint by joint.
+
+    Per joint with x = distance along the direction s of the motion, u = s v the speed along it
+    (negative where the joint must first turn back), a and w its acceleration and speed limits:
+    peak speed p = sqrt(a x + u^2 / 2); t = (2 p - u) / a where p <= w, otherwise
+    t = (w - u) / a + w / a + (x - (2 w^2 - u^2) / (2 a)) / w. s is the sign of the way that is
+    left after braking as hard as possible.
+
+    Args:
+        q: Angles (n,) of the first n joints in rad.
+        velocity: Their velocities (n,) in rad/s.
+        goals: Goal configurations (m, n) in rad.
+
+    Returns:
+        Time of the slowest joint (m,) in s, and the sum over joints of (distance / speed)^2 (m,)
+        in s^2.
+    """
+    a, w = robot.JOINT_ACCELERATION_RAD_S2[: len(q)], robot.JOINT_SPEED_RAD_S[: len(q)]
+    way = goals - q
+    v = np.clip(velocity, -w, w)
+    direction = np.where(way - v * np.abs(v) / (2.0 * a) >= 0.0, 1.0, -1.0)
+    x, u = direction * way, direction * v
+    peak = np.sqrt(np.maximum(a * x + 0.5 * u**2, 0.0))
+    bang_bang = (2.0 * peak - u) / a
+    cruising = (2.0 * w - u) / a + (x - (2.0 * w**2 - u**2) / (2.0 * a)) / w
+    times = np.where(peak <= w, bang_bang, cruising)
+    return times.max(axis=-1), ((way / w) ** 2).sum(axis=-1)
+
+
+class Expert:
+    """Answers with the best action for the environment's present state.
+
+    Follows :class:`hvs_suite.rollout.Policy`; the observation is not looked at.
+    """
+
+    def __init__(self, env: Environment) -> None:
+        """Attaches the expert to an environment.
+
+        Raises:
+            OptionError: The environment's action mode is not ``joint_position``.
+        """
+        if env.variant.action_mode != "joint_position":
+            raise OptionError(
+                f"The expert commands joint positions, not {env.variant.action_mode}: load the "
+                "task with action_mode='joint_position'."
+            )
+        self._env = env
+        self._kinematics: Kinematics = kinematics()
+        self._period_s = env.variant.control_period_s
+        self._goal_key: bytes = b""
+        self._family: FloatArray = np.empty((0, 7))
+        self._ruckig = ruckig.Ruckig(7)
+        self._input = ruckig.InputParameter(7)
+        self._input.max_velocity = list(robot.JOINT_SPEED_RAD_S)
+        self._input.max_acceleration = list(robot.JOINT_ACCELERATION_RAD_S2)
+        # No jerk limit: within a control step the cell's set point moves at constant speed, so a
+        # ramp that is shorter than the step cannot be executed, and a longer one costs time.
+
+    def reset(self) -> None:
+        """Nothing to forget: every decision stands on the present state alone."""
+
+    def select_action(
+        self, observation: collections.abc.Mapping[str, npt.NDArray[np.generic]]
+    ) -> npt.NDArray[np.float32]:
+        """The expert's action (7,) in [-1, 1] for the environment's present state."""
+        return self.label()
+
+    def label(self) -> npt.NDArray[np.float32]:
+        """The expert's action (7,) in [-1, 1] for the environment's present state."""
+        truth = self._env.privileged()
+        position, normal = truth["goal_position"], truth["goal_normal"]
+        self._remember_goal(position, normal)
+        q, velocity = self._state_when_action_acts()
+        target = self._next_set_point(q, velocity, position, normal)
+        return np.asarray(self._env.commandable(target), dtype=np.float32)
+
+    def _remember_goal(self, position: FloatArray, normal: FloatArray) -> None:
+        """Computes the goal's family of configurations once a goal."""
+        key = position.tobytes() + normal.tobytes()
+        if key != self._goal_key:
+            self._goal_key = key
+            self._family = self._kinematics.goal_configurations_at_tool_angle(
+                position, normal, tool_angle=0.0, n_swivel=N_SWIVEL
+            )
+
+    def _state_when_action_acts(self) -> tuple[FloatArray, FloatArray]:
+        """True joint angles and velocities (7,), (7,) at the moment the action takes effect.
+
+        The set points still queued move the arm first. With time constant tau = kv / kp, a joint
+        that trails a set point on a ramp from s0 to s1 over T ends at
+        s1 - tau r + (q - s0 + tau r) exp(-T / tau), where r = (s1 - s0) / T.
+        """
+        env = self._env
+        q, velocity = env.joint_positions, env.joint_velocities
+        set_point = env.setpoint
+        decay = np.exp(-self._period_s / _LAG_S)
+        for queued in env.pending_setpoints:
+            limit = robot.JOINT_SPEED_RAD_S * self._period_s
+            arrived = set_point + np.clip(queued - set_point, -limit, limit)
+            trail = _LAG_S * (arrived - set_point) / self._period_s
+            q = arrived - trail + (q - set_point + trail) * decay
+            velocity = (arrived - q) / _LAG_S
+            set_point = arrived
+        return np.asarray(q), np.asarray(velocity)
+
+    def _next_set_point(
+        self, q: FloatArray, velocity: FloatArray, position: FloatArray, normal: FloatArray
+    ) -> FloatArray:
+        """Where the set point (7,) shall be at the end of the control step."""
+        candidates = self._ranked_goals(q, velocity, position, normal)
+        if len(candidates) == 0:
+            return q  # Out of reach: stand still.
+        required = min(CLEARANCE_M, self._kinematics.clearance(q) - 1e-3)
+        rejected: list[FloatArray] = []
+        best: tuple[float, ruckig.Trajectory] | None = None
+        for goal in candidates:
+            if any(np.abs(goal - other).max() < _DISTINCT_RAD for other in rejected):
+                continue
+            motion = self._motion(q, velocity, goal)
+            least = self._least_clearance(motion, required)
+            if best is None or least > best[0]:
+                best = (least, motion)
+            if least >= required:
+                break
+            rejected.append(goal)
+            if len(rejected) >= _MAX_PATHS:
+                break
+        assert best is not None
+        motion = best[1]
+        # The arm trails its set point by the lag, so the set point leads by it.
+        ahead = min(self._period_s + _LAG_S, motion.duration)
+        return np.asarray(motion.at_time(ahead)[0])
+
+    def _ranked_goals(
+        self, q: FloatArray, velocity: FloatArray, position: FloatArray, normal: FloatArray
+    ) -> FloatArray:
+        """Goal configurations (m, 7), the one reached soonest first.
+
+        A7 alone turns the free yaw, so it is left where it comes to rest.
+        """
+        a = robot.JOINT_ACCELERATION_RAD_S2[6]
+        rest = q[6] + velocity[6] * abs(velocity[6]) / (2.0 * a)
+        tool_angle = np.clip(rest, -robot.JOINT_RANGE_RAD[6], robot.JOINT_RANGE_RAD[6])
+        family = self._family
+        nearest = self._nearest_goal(q, velocity, position, normal)
+        if nearest is not None:
+            family = np.concatenate([family, nearest[None]])
+        if len(family) == 0:
+            return family
+        times, effort = stopping_travel_time(q[:6], velocity[:6], family[:, :6])
+        order = np.argsort(times + TIE_BREAK_S * effort, kind="stable")
+        ranked = family[order]
+        ranked[:, 6] = tool_angle
+        return ranked
+
+    def _nearest_goal(
+        self, q: FloatArray, velocity: FloatArray, position: FloatArray, normal: FloatArray
+    ) -> FloatArray | None:
+        """The goal configuration (7,) nearest to where the arm comes to rest, by Gauss-Newton.
+
+        Distances are weighed by the accelerations, as travel times over short ways are. None far
+        from the goal, where the family's one-degree grid is as good, or outside the joint ranges.
+        """
+        a = robot.JOINT_ACCELERATION_RAD_S2
+        goal = q + velocity * np.abs(velocity) / (2.0 * a)
+        across = np.linalg.svd(normal[None])[2][1:]
+        for iteration in range(_ITERATIONS):
+            R, flange = self._kinematics.flange_pose(goal)
+            away = position - flange
+            if iteration == 0 and np.linalg.norm(away) > PROJECTION_RANGE_M:
+                return None
+            # Rotation vector that takes the flange axis onto the inward normal; yaw stays free.
+            turn = np.cross(R[:, 2], -normal)
+            error = np.concatenate([away, across @ turn])
+            if np.abs(error).max() < 1e-9:
+                break
+            jacobian = self._kinematics.jacobian(goal)
+            weighted = np.concatenate([jacobian[:3], across @ jacobian[3:]]) * a
+            goal = goal + a * (np.linalg.pinv(weighted, rcond=1e-3) @ error)
+        else:
+            return None
+        if (np.abs(goal) > robot.JOINT_RANGE_RAD).any() or R[:, 2] @ normal > 0.0:
+            return None
+        return np.asarray(goal)
+
+    def _motion(self, q: FloatArray, velocity: FloatArray, goal: FloatArray) -> ruckig.Trajectory:
+        """The time-optimal motion to rest at a goal, all joints arriving together."""
+        speed = robot.JOINT_SPEED_RAD_S
+        # Ruckig's root finding stumbles over distances at the limit of double precision.
+        start = np.where(np.abs(q - goal) < 1e-9, goal, q)
+        moving = np.where(np.abs(velocity) < 1e-9, 0.0, np.clip(velocity, -speed, speed))
+        self._input.current_position = list(start)
+        self._input.current_velocity = list(moving)
+        self._input.target_position = list(goal)
+        trajectory = ruckig.Trajectory(7)
+        self._ruckig.calculate(self._input, trajectory)
+        return trajectory
+
+    def _least_clearance(self, motion: ruckig.Trajectory, required: float) -> float:
+        """Least clearance (m) along a motion; stops looking once it falls below ``required``.
+
+        Steps as far as the arm can get within the distance found (conservative advancement).
+        """
+        least = np.inf
+        t = 0.0
+        while True:
+            q = np.asarray(motion.at_time(min(t, motion.duration))[0])
+            clearance = self._kinematics.clearance(q)
+            least = min(least, clearance)
+            if least < required or t >= motion.duration:
+                return float(least)
+            t += max(_PATH_STEP_S, (clearance - required) / _MAX_FLANGE_SPEED_M_S)
+
+
+def make_expert(env: Environment) -> Expert:
+    """The expert for an environment; a :data:`hvs_suite.rollout.PolicyFactory`."""
+    return Expert(env)

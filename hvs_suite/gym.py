@@ -1,0 +1,184 @@
+"""The named tasks as Gymnasium environments.
+
+    import gymnasium
+    import hvs_suite
+
+    env = gymnasium.make("hvs_suite/align-thesis-v1", split="train")
+    observation, info = env.reset(options={"scenario": 0})
+
+Importing this module loads neither MuJoCo nor a renderer; making an environment compiles the
+scene, and the renderer is made at the first reset, in whichever process that happens.
+"""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import dm_env
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from hvs_suite.registry import load
+from hvs_suite.tasks.variants import TASKS
+
+NAMESPACE = "hvs_suite"
+RENDER_SIDE_PX = 480
+
+Observation = dict[str, npt.NDArray[Any]]
+
+
+class AlignEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
+    """A named task behind Gymnasium's interface.
+
+    Observations are a flat ``Dict``: ``eih`` and ``eth`` uint8 (H, W, C), ``joint_positions``
+    float32 (7,) in rad and ``joint_velocities`` float32 (7,) in rad/s for the named tasks, in the
+    order and with the bounds of the task's own specification. Actions are ``Box(-1, 1, (7,))``
+    (six numbers with ``action_mode="flange_twist"``). Finite values outside are clipped and
+    counted in ``info["n_clipped"]``, because learned policies overshoot.
+
+    ``terminated`` means goal or collision, ``truncated`` the time limit. ``info`` holds Python
+    bools, ints, floats and strings: ``is_success``, ``collision``, ``truncated``, ``split``,
+    ``scenario``, ``steps``, the four errors and what else ``Environment.info`` has.
+
+    Args:
+        task: Registered name, such as ``align-thesis``.
+        split: Stream of scenarios; ``test`` holds 1,000 frozen ones.
+        render_mode: ``rgb_array``, or None where nothing is rendered for people.
+        **options: Any option of the task, for studies.
+
+    Raises:
+        UnknownTaskError: There is no such task.
+        OptionError: An option does not exist or its value makes no sense.
+        ScenarioError: The split's name is empty.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(
+        self,
+        task: str,
+        *,
+        split: str = "train",
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise gymnasium.error.UnsupportedMode(
+                f"render_mode {render_mode!r} is not supported; use 'rgb_array' or None"
+            )
+        self._environment = load(task, split=split, **options)
+        self._environment.clip_actions = True
+        self.render_mode = render_mode
+        variant = self._environment.variant
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / variant.control_period_s)}
+        self.task = variant.name
+        self.task_description = variant.instruction
+        specification = self._environment.observation_spec()
+        self.observation_space = spaces.Dict(
+            {name: _space(spec) for name, spec in specification.items()}
+        )
+        action = self._environment.action_spec()
+        self.action_space = spaces.Box(-1.0, 1.0, action.shape, np.float32)
+        self._playing = False
+        self._frame: npt.NDArray[np.uint8] | None = None
+
+    @property
+    def environment(self) -> Any:
+        """The ``dm_env`` environment behind this one, for what Gymnasium has no name for."""
+        return self._environment
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Starts an episode.
+
+        Args:
+            seed: Play scenario ``seed`` (mod 1,000 on ``test``); later bare resets walk a stream
+                of their own that depends on the seed and their count alone.
+            options: ``{"scenario": i}`` plays scenario i of the split; other keys are ignored.
+
+        Returns:
+            Observation and info.
+
+        Raises:
+            ScenarioError: The split has no such scenario.
+        """
+        super().reset(seed=seed)
+        scenario = (options or {}).get("scenario")
+        if scenario is None or seed is not None:
+            time_step = self._environment.reset(seed=seed)
+        if scenario is not None:
+            time_step = self._environment.reset(scenario=scenario)
+        self._playing = True
+        return self._observation(time_step), self._info()
+
+    def step(
+        self, action: npt.NDArray[np.float32]
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Plays one control step.
+
+        Args:
+            action: Numbers (7,) or (6,); finite values outside [-1, 1] are clipped and counted.
+
+        Returns:
+            Observation, reward, terminated (goal or collision), truncated (time limit), info.
+
+        Raises:
+            ActionError: The action has NaN, infinity or a wrong shape.
+            gymnasium.error.ResetNeeded: The episode is over, or none was started.
+        """
+        if not self._playing:
+            raise gymnasium.error.ResetNeeded("no episode is running; call reset() first")
+        time_step = self._environment.step(action)
+        info = self._info()
+        terminated = info["is_success"] or info["collision"]
+        truncated = info["truncated"]
+        self._playing = not (terminated or truncated)
+        reward = 0.0 if time_step.reward is None else float(time_step.reward)
+        return self._observation(time_step), reward, terminated, truncated, info
+
+    def render(self) -> npt.NDArray[np.uint8] | None:  # type: ignore[override]
+        """The cell as RGB (480, 480, 3) uint8, drawn once a control step; None without a mode."""
+        if self.render_mode is None:
+            gymnasium.logger.warn("render() needs render_mode='rgb_array'; nothing was drawn")
+            return None
+        if self._frame is None:
+            self._frame = self._environment.render(RENDER_SIDE_PX, RENDER_SIDE_PX)
+        return self._frame.copy()
+
+    def close(self) -> None:
+        """Frees the renderer; calling it again does nothing."""
+        self._playing = False
+        self._environment.close()
+
+    def _observation(self, time_step: dm_env.TimeStep) -> Observation:
+        self._frame = None
+        return {
+            name: np.asarray(time_step.observation[name], dtype=space.dtype)
+            for name, space in self.observation_space.items()
+        }
+
+    def _info(self) -> dict[str, Any]:
+        return {
+            name: value.item() if isinstance(value, np.generic) else value
+            for name, value in self._environment.info.items()
+        }
+
+
+def _space(spec: Any) -> spaces.Box:
+    """The Gymnasium space of one ``dm_env`` observation; floats become float32."""
+    dtype = np.uint8 if spec.dtype == np.uint8 else np.float32
+    low = np.broadcast_to(spec.minimum, spec.shape).astype(dtype)
+    high = np.broadcast_to(spec.maximum, spec.shape).astype(dtype)
+    return spaces.Box(low, high, spec.shape, dtype)  # type: ignore[arg-type]
+
+
+def register() -> None:
+    """Registers ``hvs_suite/<name>-v<version>`` for every named task; again does nothing."""
+    for name, variant in TASKS.items():
+        identifier = f"{NAMESPACE}/{name}-v{variant.version}"
+        if identifier not in gymnasium.registry:
+            # A string, so that registering imports nothing; time limit and order of calls are the
+            # environment's own.
+            gymnasium.register(identifier, "hvs_suite.gym:AlignEnv", kwargs={"task": name})
