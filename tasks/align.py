@@ -94,8 +94,8 @@ class Align(ServoTask):
         self._act = physics.model.actuator_actadr[self._actuators].copy()
         self._flange = int(physics.bind(robot.flange).element_id)
         self._flange_body = int(physics.bind(robot.flange_body).element_id)
-        self._marker_geom = int(physics.bind(cell.marker.geom).element_id)
-        self._mocap = int(physics.model.body_mocapid[physics.model.geom_bodyid[self._marker_geom]])
+        self.marker_geom = int(physics.bind(cell.marker.geom).element_id)
+        self._mocap = int(physics.model.body_mocapid[physics.model.geom_bodyid[self.marker_geom]])
         self.cameras = {
             "eih": cameras.Camera(
                 "eih",
@@ -362,6 +362,15 @@ class Align(ServoTask):
         """
         encoder = np.asarray(q, np.float64) + self.scenario.joint_offset
         return np.clip(encoder / JOINT_RANGE_RAD, -1.0, 1.0).astype(np.float32)
+
+    def place(self, physics: mjcf.Physics, q: FloatArray) -> None:
+        """Put the arm at rest at joint angles (7,) rad, for certificates and pictures."""
+        data = physics.data.ptr
+        data.qpos[self._qpos] = q
+        data.qvel[self._qvel] = 0.0
+        data.act[self._act] = q
+        mujoco.mj_step1(physics.model.ptr, data)
+        self._measure(physics)
 
     def view(self, physics: mjcf.Physics, camera: str) -> int | mujoco.MjvCamera:
         """Camera for pictures: ``eih``, ``eth``, or ``cell`` for a third-person view."""

@@ -9,10 +9,12 @@ then forked (Gymnasium's ``AsyncVectorEnv`` does) would wait for them forever. W
 ``LP_NUM_THREADS=0`` it draws in the calling thread, which is as fast on one core, and safe.
 """
 
+import atexit
 import ctypes.util
 import importlib
 import os
 import sys
+import weakref
 from typing import Any, Protocol
 
 from hvs_suite.errors import RenderError
@@ -20,6 +22,9 @@ from hvs_suite.errors import RenderError
 BACKENDS = ("egl", "osmesa", "glfw")
 _LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa", "glfw": "GL"}
 PACKAGES = {"egl": "libegl1", "osmesa": "libosmesa6", "glfw": "libgl1 and a display"}
+
+
+_exit_calls: list["weakref.finalize[..., Any]"] = []
 
 
 class GLContext(Protocol):
@@ -94,3 +99,22 @@ def create_context(width: int, height: int) -> GLContext:
             f"{', '.join(BACKENDS)}; 'hvs doctor' tells which work"
         ) from error
     return context
+
+
+def free_at_exit(free: "weakref.finalize[..., Any]") -> None:
+    """Have a context freed before the interpreter's exit takes the graphics library down.
+
+    Exit handlers run in reverse: MuJoCo registers its own while a context is first created, so one
+    that is registered after that runs in time. Contexts left alive end in noise on the terminal.
+
+    Args:
+        free: Frees the context when it is called or its owner is collected.
+    """
+    if not _exit_calls:
+        atexit.register(_free_all)
+    _exit_calls[:] = [*(call for call in _exit_calls if call.alive), free]
+
+
+def _free_all() -> None:
+    for free in _exit_calls:
+        free()

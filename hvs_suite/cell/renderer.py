@@ -59,8 +59,9 @@ class Renderer:
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
         self._buffers: dict[tuple[int, int, str], npt.NDArray[Any]] = {}
-        # Runs at the latest before the interpreter takes EGL down, which is silent only then.
         self._free = weakref.finalize(self, _free, self._gl, self._context)
+        self._free.atexit = False
+        gl.free_at_exit(self._free)
 
     def colour(
         self, data: mujoco.MjData, camera: int | mujoco.MjvCamera, height: int, width: int
