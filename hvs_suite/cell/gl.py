@@ -44,7 +44,7 @@ def choose_backend() -> str:
         ``egl``, ``osmesa`` or ``glfw``; ``off`` where none is installed (states still work).
 
     Raises:
-        RenderError: ``MUJOCO_GL`` is set to something that is not a backend.
+        RenderError: ``MUJOCO_GL`` names something that is not a backend, or is not installed.
     """
     if os.environ.get("LP_NUM_THREADS", "1") == "1":
         os.environ["LP_NUM_THREADS"] = "0"
@@ -54,6 +54,12 @@ def choose_backend() -> str:
             raise RenderError(
                 f"MUJOCO_GL={wanted!r} is not a backend; use one of {', '.join(BACKENDS)}, "
                 "or unset it to let hvs_suite choose"
+            )
+        if wanted in ("egl", "osmesa") and not ctypes.util.find_library(_LIBRARIES[wanted]):
+            # MuJoCo itself would fail at import, with an AttributeError.
+            raise RenderError(
+                f"MUJOCO_GL={wanted}, but lib{_LIBRARIES[wanted]} is missing; install "
+                f"{PACKAGES[wanted]}, or unset MUJOCO_GL to let hvs_suite choose"
             )
         return wanted if wanted in BACKENDS else "off"
     for backend in BACKENDS:

@@ -11,6 +11,7 @@ import subprocess
 import sys
 
 from hvs_suite.cli import console
+from hvs_suite.errors import RenderError
 
 PROBE_TIMEOUT_S = 120.0
 FAILED = 1
@@ -74,13 +75,11 @@ class Doctor:
 
     def run(self) -> int:
         """Probe everything, print the findings, and judge them."""
-        from hvs_suite.cell.gl import choose_backend
-
         named = os.environ.get("MUJOCO_GL")
         with concurrent.futures.ThreadPoolExecutor() as pool:
             renderers = dict(zip(LIBRARIES, pool.map(probe_renderer, LIBRARIES), strict=True))
             decoders = dict(zip(DECODERS, pool.map(probe_decoder, DECODERS), strict=True))
-        in_use = choose_backend()
+        in_use = backend_in_use()
         renders = in_use in renderers and renderers[in_use].works
         if self.json:
             console.print_json(
@@ -109,6 +108,16 @@ class Doctor:
         else:
             print("Nothing renders here. Mend: apt-get install libegl1 libgl1-mesa-dri")
         return FAILED
+
+
+def backend_in_use() -> str:
+    """The backend that the suite would render with; ``off`` where there is none."""
+    try:
+        from hvs_suite.cell.gl import choose_backend
+
+        return choose_backend()
+    except RenderError:
+        return os.environ.get("MUJOCO_GL", "off")
 
 
 def probe_renderer(backend: str) -> Probe:
