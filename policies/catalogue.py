@@ -1,0 +1,70 @@
+"""Finds policies by name: the expert, the floor, shipped weights, or a checkpoint folder."""
+
+import difflib
+from pathlib import Path
+
+from hvs_suite.errors import PolicyError, UnknownTaskError
+from hvs_suite.rollout import PolicyFactory
+from hvs_suite.tasks.variants import TASKS
+
+BUILTIN = ("expert", "zero", "random")
+SHIPPED = ("pretrained", "finetuned")
+NAMES = (*BUILTIN, "servo", *SHIPPED)
+HERE = Path(__file__).resolve().parent
+
+
+def policy_factory(spec: str, task: str) -> PolicyFactory:
+    """Find a policy for a task.
+
+    Args:
+        spec: ``expert``, ``zero``, ``random``, ``servo``, ``pretrained``, ``finetuned`` (the
+            weights shipped for the task), or a checkpoint folder.
+        task: Named task.
+
+    Returns:
+        Builds the policy for an environment; pickles, so that workers can build their own.
+
+    Raises:
+        PolicyError: There is no such policy, it cannot be loaded, or it does not fit the task.
+        UnknownTaskError: There is no such task.
+    """
+    if task not in TASKS:
+        close = difflib.get_close_matches(task, TASKS, n=2) or list(TASKS)
+        raise UnknownTaskError(f"unknown task {task!r}; did you mean {' or '.join(close)}?")
+    if spec in BUILTIN:
+        return _builtin(spec)
+    if spec == "servo":
+        raise PolicyError("this version has no servo policy; try expert or a checkpoint folder")
+    if spec in SHIPPED:
+        folder = HERE / spec / task
+        if not folder.is_dir():
+            raise PolicyError(
+                f"this version ships no {spec} weights for {task}; train your own with hvs pretrain"
+            )
+        return _checkpoint(folder, task)
+    folder = Path(spec)
+    if not folder.is_dir():
+        close = difflib.get_close_matches(spec, NAMES, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"use {', '.join(NAMES)}, or a folder"
+        raise PolicyError(f"{spec!r} is neither a policy nor a checkpoint folder; {hint}")
+    return _checkpoint(folder, task)
+
+
+def _builtin(name: str) -> PolicyFactory:
+    if name == "expert":
+        from hvs_suite.datasets.expert import make_expert
+
+        return make_expert
+    from hvs_suite.policies import builtin
+
+    return builtin.make_zero if name == "zero" else builtin.make_random
+
+
+def _checkpoint(folder: Path, task: str) -> PolicyFactory:
+    """Check a checkpoint here and now, before workers are started for it."""
+    try:
+        from hvs_suite.policies import checkpoint
+    except ImportError as error:
+        raise PolicyError(f"playing {folder} needs torch; install hvs-suite[learn]") from error
+    checkpoint.check_fit(checkpoint.read_config(folder), folder, TASKS[task])
+    return checkpoint.CheckpointFactory(str(folder.resolve()))

@@ -1,0 +1,274 @@
+"""Plays a checkpoint folder, ours or any other LeRobot policy's, in an environment.
+
+A checkpoint of type `hvs` whose processors are the standard identity ones is played by its network
+alone: LeRobot's policies take ten seconds and a gigabyte to import, in every worker. Tests hold
+that both ways give the same action. Anything else goes through LeRobot.
+"""
+
+import contextlib
+import dataclasses
+import json
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from hvs_suite.errors import PolicyError
+from hvs_suite.policies.hvs.network import (
+    IMAGE_PREFIX,
+    N_JOINTS,
+    STATE,
+    HvsNetwork,
+    shape_from_config,
+)
+from hvs_suite.rollout import Observation
+from hvs_suite.tasks.variants import AlignVariant, observation_names
+
+Action = npt.NDArray[np.float32]
+Decide = Callable[[dict[str, Tensor]], Tensor]
+
+# Where the network's own keys live in a checkpoint of the LeRobot policy around it.
+NETWORK_PREFIX = "network."
+STANDARD_STEPS = {
+    "policy_preprocessor.json": (
+        "rename_observations_processor",
+        "to_batch_processor",
+        "device_processor",
+        "normalizer_processor",
+    ),
+    "policy_postprocessor.json": ("unnormalizer_processor", "device_processor"),
+}
+
+
+class Stage(Protocol):
+    """What a checkpoint needs of an environment."""
+
+    @property
+    def variant(self) -> AlignVariant:
+        """Parameters of the task."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CheckpointFactory:
+    """Makes policies from a checkpoint folder; travels to workers as its path.
+
+    Attributes:
+        folder: The checkpoint.
+    """
+
+    folder: str
+
+    def __call__(self, env: Stage) -> "CheckpointPolicy":
+        """Load the checkpoint for an environment.
+
+        Raises:
+            PolicyError: It cannot be loaded, or does not fit the environment.
+        """
+        return CheckpointPolicy(Path(self.folder), env.variant)
+
+
+class CheckpointPolicy:
+    """A LeRobot policy behind the suite's policy interface.
+
+    Args:
+        folder: The checkpoint.
+        variant: Task to be played.
+
+    Raises:
+        PolicyError: The checkpoint cannot be loaded, or does not fit the task.
+    """
+
+    def __init__(self, folder: Path, variant: AlignVariant) -> None:
+        config = read_config(folder)
+        check_fit(config, folder, variant)
+        self._inputs = tuple(config["input_features"])
+        with _one_thread():
+            if config.get("type") == "hvs" and _processors_are_standard(folder):
+                self._decide, self._forget = _network(folder, config)
+            else:
+                self._decide, self._forget = _lerobot(folder, variant.instruction)
+
+    def reset(self) -> None:
+        """Forget the last episode."""
+        self._forget()
+
+    def select_action(self, observation: Observation) -> Action:
+        """Decide on an unbatched observation of the environment.
+
+        Args:
+            observation: ``eih`` and ``eth`` (H, W, C) uint8, ``joint_positions`` (7,) rad and
+                ``joint_velocities`` (7,) rad/s, as far as the policy reads them.
+
+        Returns:
+            (7,) float32.
+        """
+        with _one_thread(), torch.no_grad():
+            action = self._decide(self._batch(observation))
+        return np.array(action.reshape(-1).cpu().numpy(), np.float32)
+
+    def _batch(self, observation: Observation) -> dict[str, Tensor]:
+        """LeRobot's names and ranges, without a batch dimension."""
+        batch: dict[str, Tensor] = {}
+        for key in self._inputs:
+            if key.startswith(IMAGE_PREFIX):
+                image = torch.from_numpy(observation[key.removeprefix(IMAGE_PREFIX)])
+                batch[key] = image.permute(2, 0, 1).to(torch.float32) / 255.0
+        parts = ["joint_positions", "joint_velocities"]
+        joints = [observation[name] for name in parts if name in observation]
+        if STATE in self._inputs:
+            batch[STATE] = torch.from_numpy(np.concatenate(joints).astype(np.float32))
+        return batch
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """Read a checkpoint's ``config.json``.
+
+    Args:
+        folder: The checkpoint.
+
+    Returns:
+        The parsed file.
+
+    Raises:
+        PolicyError: The folder is not a checkpoint.
+    """
+    for name in ("config.json", "model.safetensors", *STANDARD_STEPS):
+        if not (folder / name).is_file():
+            raise PolicyError(f"{folder} is not a LeRobot checkpoint: it has no {name}")
+    try:
+        config = json.loads((folder / "config.json").read_text())
+    except (OSError, ValueError) as error:
+        raise PolicyError(f"{folder}/config.json cannot be read: {error}") from error
+    if not isinstance(config, dict) or not isinstance(config.get("input_features"), dict):
+        raise PolicyError(f"{folder}/config.json names no input_features")
+    return config
+
+
+def check_fit(config: Mapping[str, Any], folder: Path, variant: AlignVariant) -> None:
+    """Check that a task shows what a checkpoint reads, in the same size, and takes its actions.
+
+    Args:
+        config: Of the checkpoint.
+        folder: The checkpoint, for the message.
+        variant: The task.
+
+    Raises:
+        PolicyError: It does not fit.
+    """
+    shown = observation_names(variant.observations)
+    mismatch = f"{folder} does not fit {variant.name}: "
+    if variant.action_mode != "joint_position" or variant.normalise_observation:
+        raise PolicyError(
+            mismatch + "checkpoints read raw observations and command joint positions"
+        )
+    for key, feature in config["input_features"].items():
+        shape = tuple(feature["shape"])
+        name = key.removeprefix(IMAGE_PREFIX)
+        if key == STATE:
+            available = N_JOINTS * sum(
+                part in shown for part in ("joint_positions", "joint_velocities")
+            )
+            if "joint_positions" not in shown or shape != (available,):
+                raise PolicyError(
+                    mismatch + f"it reads {shape[0]} joint numbers, the task shows {available}"
+                )
+        elif name == key or name not in shown or name not in ("eih", "eth"):
+            raise PolicyError(mismatch + f"it reads {key}, which the task does not show")
+        else:
+            side = getattr(variant, f"{name}_resolution")
+            expected = (getattr(variant, f"{name}_channels"), side, side)
+            if shape != expected:
+                raise PolicyError(
+                    mismatch + f"it reads {key} as {_size(shape)}, the task shows {_size(expected)}"
+                )
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return " x ".join(str(n) for n in (*shape[1:], shape[0]))
+
+
+def _processors_are_standard(folder: Path) -> bool:
+    """Whether the processors do nothing but add a batch dimension."""
+    for name, expected in STANDARD_STEPS.items():
+        try:
+            steps = json.loads((folder / name).read_text())["steps"]
+            if tuple(step["registry_name"] for step in steps) != expected:
+                return False
+        except (OSError, ValueError, KeyError, TypeError):
+            return False
+        for step in steps:
+            settings = step.get("config", {})
+            if settings.get("rename_map"):
+                return False
+            if any(mode != "IDENTITY" for mode in settings.get("norm_map", {}).values()):
+                return False
+    return True
+
+
+def _network(folder: Path, config: Mapping[str, Any]) -> tuple[Decide, Callable[[], None]]:
+    """Load the network of an `hvs` checkpoint, without LeRobot."""
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        shape = shape_from_config(config)
+        network = HvsNetwork(shape)
+        weights = load_file(folder / "model.safetensors")
+        network.load_state_dict({k.removeprefix(NETWORK_PREFIX): v for k, v in weights.items()})
+    except (SafetensorError, OSError, KeyError, ValueError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise PolicyError(f"{folder} cannot be loaded as an hvs policy: {reason}") from error
+    network.eval()
+
+    def decide(batch: dict[str, Tensor]) -> Tensor:
+        images = {name: batch[IMAGE_PREFIX + name][None] for name in shape.cameras}
+        state = batch[STATE][None] if shape.state_dim else None
+        return network.to_action(network(images, state)[0], state)
+
+    return decide, lambda: None
+
+
+def _lerobot(folder: Path, instruction: str) -> tuple[Decide, Callable[[], None]]:
+    """Load any LeRobot policy with its processors, on the CPU."""
+    try:
+        from lerobot.configs import PreTrainedConfig
+        from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+    except ImportError as error:
+        raise PolicyError("LeRobot is missing; install hvs-suite[learn]") from error
+    import hvs_suite.policies.hvs.configuration_hvs  # noqa: F401 - registers the type
+
+    try:
+        config = PreTrainedConfig.from_pretrained(folder, local_files_only=True)
+        config.device = "cpu"
+        policy = get_policy_class(config.type).from_pretrained(
+            folder, config=config, local_files_only=True
+        )
+        before, after = make_pre_post_processors(
+            config,
+            pretrained_path=str(folder),
+            preprocessor_overrides={"device_processor": {"device": "cpu"}},
+        )
+    except Exception as error:  # LeRobot and what it loads raise anything
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise PolicyError(f"LeRobot cannot load {folder}: {reason}") from error
+
+    def decide(batch: dict[str, Tensor]) -> Tensor:
+        action: Tensor = after(policy.select_action(before({**batch, "task": instruction})))
+        return action
+
+    return decide, policy.reset
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Decide on one thread: as fast for one frame, and the sums are the same in every process."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,255 @@
+"""A recorded LeRobot dataset as training sees it: columns in memory, frames in a cache.
+
+Reads the dataset's own files (format v3, frames as images) without importing LeRobot's dataset
+package, which takes longer than opening a small dataset.
+"""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow.parquet as pq
+import torch
+from torch import Tensor
+
+from hvs_suite.errors import DatasetError
+from hvs_suite.policies.frame_cache import Frames, OnFrames, cached_frames, data_files
+from hvs_suite.policies.hvs.geometry import Calibration, calibrate
+from hvs_suite.policies.hvs.network import IMAGE_PREFIX, N_JOINTS, STATE
+
+ACTION = "action"
+EPISODE = "episode_index"
+GOAL_POSITION = "privileged.goal_position"
+GOAL_NORMAL = "privileged.goal_normal"
+TARGET_PREFIX = "privileged.target_"
+# Held out from training to measure the loss on; whole episodes, so that no neighbour frame leaks.
+HELD_OUT_SHARE = 0.05
+# Philox words that keep this stream apart from the training order.
+HELD_OUT_STREAM = 1
+
+Column = npt.NDArray[Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Manifest:
+    """What a dataset says of itself.
+
+    Attributes:
+        root: The dataset.
+        task: Named task that it was recorded on.
+        split: Split of its scenarios.
+        options: Task options that differ from the named task's.
+        features: LeRobot's features by key.
+        n_frames: Frames.
+        n_episodes: Episodes.
+    """
+
+    root: Path
+    task: str
+    split: str
+    options: Mapping[str, Any]
+    features: Mapping[str, Mapping[str, Any]]
+    n_frames: int
+    n_episodes: int
+
+    @property
+    def cameras(self) -> dict[str, tuple[int, int, int]]:
+        """Camera name to (H, W, C) of its frames."""
+        return {
+            key.removeprefix(IMAGE_PREFIX): (shape[0], shape[1], shape[2])
+            for key, feature in sorted(self.features.items())
+            if key.startswith(IMAGE_PREFIX)
+            for shape in [tuple(feature["shape"])]
+        }
+
+
+def read_manifest(root: Path) -> Manifest:
+    """Read ``meta/info.json`` and ``hvs.json``.
+
+    Args:
+        root: The dataset.
+
+    Returns:
+        The manifest.
+
+    Raises:
+        DatasetError: There is no such dataset, it is empty, or it was not recorded by this suite.
+    """
+    info = _read_json(root / "meta" / "info.json", f"{root} is not a LeRobot dataset")
+    ours = _read_json(root / "hvs.json", f"{root} was not recorded with hvs record")
+    try:
+        manifest = Manifest(
+            root=root,
+            task=str(ours["task"]),
+            split=str(ours["split"]),
+            options=dict(ours.get("options") or {}),
+            features=info["features"],
+            n_frames=int(info["total_frames"]),
+            n_episodes=int(info["total_episodes"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise DatasetError(f"{root}: hvs.json or meta/info.json lacks {error}") from error
+    if manifest.n_frames == 0:
+        raise DatasetError(f"{root} is empty; record at least two episodes")
+    return manifest
+
+
+def refuse_test_split(manifest: Manifest) -> None:
+    """Keep the scenarios that policies are scored on out of training.
+
+    Args:
+        manifest: Of the dataset.
+
+    Raises:
+        DatasetError: It was recorded on ``test``.
+    """
+    if manifest.split == "test":
+        raise DatasetError(
+            f"{manifest.root} was recorded on the test split, which scores policies; "
+            "record with --split train"
+        )
+
+
+class Demonstrations:
+    """Frames and labels of one dataset.
+
+    Args:
+        manifest: Of the dataset.
+        cache: Folder for decoded frames.
+        seed: Chooses the held-out episodes.
+        on_frames: Called with the number of frames just decoded, over all cameras.
+
+    Attributes:
+        manifest: As given.
+        training: Indices of the frames to learn from.
+        held_out: Indices of the frames of held-out episodes; empty for a single episode.
+
+    Raises:
+        DatasetError: The dataset lacks what training needs.
+    """
+
+    def __init__(
+        self, manifest: Manifest, cache: Path, seed: int, on_frames: OnFrames | None = None
+    ) -> None:
+        self.manifest = manifest
+        self._columns = _read_columns(manifest)
+        self._frames: dict[str, Frames] = {}
+        for name, shape in manifest.cameras.items():
+            key = IMAGE_PREFIX + name
+            if manifest.features[key]["dtype"] != "image":
+                raise DatasetError(
+                    f"{manifest.root}: {key} is video; train on the lossless recording instead"
+                )
+            self._frames[key] = cached_frames(
+                manifest.root, key, shape, manifest.n_frames, cache, on_frames
+            )
+        episodes = self._columns[EPISODE]
+        names = np.unique(episodes)
+        stream = np.random.Generator(np.random.Philox(key=[seed, HELD_OUT_STREAM]))
+        n_held_out = max(1, round(HELD_OUT_SHARE * len(names))) if len(names) > 1 else 0
+        held_out = np.isin(episodes, stream.permutation(names)[:n_held_out])
+        self.training = np.flatnonzero(~held_out)
+        self.held_out = np.flatnonzero(held_out)
+
+    def batch(self, indices: npt.NDArray[np.int64]) -> dict[str, Tensor]:
+        """Frames as LeRobot's loader would give them.
+
+        Args:
+            indices: Of the frames, (B,).
+
+        Returns:
+            Images (B, C, H, W) float32 in [0, 1], and the columns of `_read_columns`, float32.
+        """
+        # Neighbours on disk together: the same rows, fewer page faults.
+        indices = np.sort(indices)
+        batch = {
+            key: torch.from_numpy(column[indices])
+            for key, column in self._columns.items()
+            if key != EPISODE
+        }
+        for key, frames in self._frames.items():
+            images = torch.from_numpy(frames[indices])
+            # (B, H, W, C) stays the layout in memory, which is what the convolutions want.
+            batch[key] = images.to(torch.float32).div_(255.0).permute(0, 3, 1, 2)
+        return batch
+
+
+def calibration_of(root: Path) -> Calibration:
+    """Fit the camera maps of the `hvs` network to a dataset's privileged columns.
+
+    Args:
+        root: The dataset.
+
+    Returns:
+        The calibration.
+
+    Raises:
+        DatasetError: The dataset lacks the columns.
+    """
+    manifest = read_manifest(root)
+    columns = _read_columns(manifest)
+    missing = {STATE, GOAL_POSITION, GOAL_NORMAL} - set(columns)
+    if missing:
+        raise DatasetError(f"{root} lacks {', '.join(sorted(missing))}")
+    double = {key: column.astype(np.float64) for key, column in columns.items()}
+    return calibrate(
+        q=double[STATE][:, :N_JOINTS],
+        goal_position=double[GOAL_POSITION],
+        goal_normal=double[GOAL_NORMAL],
+        standoff_m=_standoff(manifest),
+        target_eih=double.get(TARGET_PREFIX + "eih"),
+        target_eth=double.get(TARGET_PREFIX + "eth"),
+    )
+
+
+def _standoff(manifest: Manifest) -> float:
+    from hvs_suite.tasks.variants import TASKS
+
+    if manifest.task not in TASKS:
+        raise DatasetError(f"{manifest.root} was recorded on {manifest.task}, an unknown task")
+    return float(manifest.options.get("standoff_m", TASKS[manifest.task].standoff_m))
+
+
+def _read_columns(manifest: Manifest) -> dict[str, Column]:
+    """Read the columns that training uses: state, action, targets, goal, episode.
+
+    Returns:
+        Key to (n_frames, k) float32; ``episode_index`` to (n_frames,) int64.
+    """
+    wanted = {STATE, ACTION, GOAL_POSITION, GOAL_NORMAL}
+    wanted |= {TARGET_PREFIX + name for name in manifest.cameras}
+    keys = [key for key in manifest.features if key in wanted]
+    if ACTION not in keys or not manifest.cameras:
+        raise DatasetError(f"{manifest.root} needs an action and at least one camera to learn from")
+    parts: dict[str, list[Column]] = {key: [] for key in [*keys, EPISODE]}
+    for path in data_files(manifest.root):
+        try:
+            table = pq.read_table(path, columns=[*keys, EPISODE])
+        except (OSError, ValueError) as error:
+            raise DatasetError(f"{path} cannot be read: {error}") from error
+        for key in keys:
+            column = table.column(key).combine_chunks()
+            width = int(manifest.features[key]["shape"][0])
+            flat = column.flatten().to_numpy(zero_copy_only=False)
+            parts[key].append(flat.reshape(-1, width).astype(np.float32))
+        parts[EPISODE].append(table.column(EPISODE).to_numpy().astype(np.int64))
+    columns = {key: np.concatenate(arrays) for key, arrays in parts.items()}
+    if len(columns[EPISODE]) != manifest.n_frames:
+        raise DatasetError(
+            f"{manifest.root} declares {manifest.n_frames} frames but holds "
+            f"{len(columns[EPISODE])}; record it again"
+        )
+    return columns
+
+
+def _read_json(path: Path, otherwise: str) -> dict[str, Any]:
+    try:
+        return dict(json.loads(path.read_text()))
+    except OSError as error:
+        raise DatasetError(f"{otherwise}: no readable {path.name}") from error
+    except ValueError as error:
+        raise DatasetError(f"{otherwise}: {path.name} is not JSON") from error

@@ -1,0 +1,127 @@
+"""Camera frames of a LeRobot dataset, decoded once into memory-mapped arrays on disk.
+
+Forty thousand frames at 336 px are 13.5 GB: they stay on disk as uint8, and the operating system
+keeps in memory what training reads. Decoding a PNG costs ten times what reading the cache does.
+"""
+
+import contextlib
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pyarrow.parquet as pq
+
+from hvs_suite.errors import DatasetError
+from hvs_suite.files import replacing
+
+Frames = npt.NDArray[np.uint8]
+OnFrames = Callable[[int], None]
+ROWS_AT_ONCE = 256
+
+
+def data_files(root: Path) -> list[Path]:
+    """Tabular files of a dataset, in frame order.
+
+    Args:
+        root: The dataset.
+
+    Returns:
+        The files.
+
+    Raises:
+        DatasetError: There are none.
+    """
+    files = sorted((root / "data").glob("chunk-*/file-*.parquet"))
+    if not files:
+        raise DatasetError(f"{root} holds no data/chunk-*/file-*.parquet; record it first")
+    return files
+
+
+def fingerprint(root: Path) -> str:
+    """Short digest of a dataset's files by name, size and time of change."""
+    parts = []
+    for path in [root / "meta" / "info.json", *data_files(root)]:
+        stat = path.stat()
+        parts.append(f"{path.relative_to(root)} {stat.st_size} {stat.st_mtime_ns}")
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+
+def cached_frames(
+    root: Path,
+    key: str,
+    shape: Sequence[int],
+    n_frames: int,
+    folder: Path,
+    on_frames: OnFrames | None = None,
+) -> Frames:
+    """Open the frames of one camera, decoding them first if the cache is not of this dataset.
+
+    Args:
+        root: The dataset.
+        key: Feature of dtype ``image``, e.g. ``observation.images.eih``.
+        shape: (H, W, C) of its frames.
+        n_frames: Frames in the dataset.
+        folder: Where the cache lives; made if missing.
+        on_frames: Called with the number of frames just decoded.
+
+    Returns:
+        (n_frames, H, W, C) uint8, memory-mapped and read-only.
+
+    Raises:
+        DatasetError: A frame is missing, cannot be decoded, or has another size.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{key}.npy"
+    made_from = folder / f"{key}.json"
+    stamp = {"dataset": fingerprint(root), "shape": [n_frames, *shape]}
+    # A half-written cache has no stamp, because the stamp is written last.
+    with contextlib.suppress(OSError, ValueError):
+        if json.loads(made_from.read_text()) == stamp:
+            return _open(path)
+    made_from.unlink(missing_ok=True)
+    frames = np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=(n_frames, *shape))
+    done = 0
+    for encoded in _encoded(root, key):
+        if done >= n_frames:
+            raise DatasetError(f"{root} holds more than the {n_frames} frames that it declares")
+        frames[done] = _decode(encoded, tuple(shape), f"frame {done} of {key}")
+        done += 1
+        if on_frames is not None and done % ROWS_AT_ONCE == 0:
+            on_frames(ROWS_AT_ONCE)
+    if done != n_frames:
+        raise DatasetError(f"{root} declares {n_frames} frames but holds {done}; record it again")
+    frames.flush()
+    del frames
+    with replacing(made_from) as temporary:
+        temporary.write_text(json.dumps(stamp))
+    if on_frames is not None and done % ROWS_AT_ONCE:
+        on_frames(done % ROWS_AT_ONCE)
+    return _open(path)
+
+
+def _open(path: Path) -> Frames:
+    return np.load(path, mmap_mode="r", allow_pickle=False)  # type: ignore[no-any-return]
+
+
+def _encoded(root: Path, key: str) -> Iterator[bytes]:
+    for path in data_files(root):
+        for batch in pq.ParquetFile(path).iter_batches(ROWS_AT_ONCE, columns=[key]):
+            for cell in batch.column(0).to_pylist():
+                content = cell["bytes"]
+                yield content if content is not None else (root / cell["path"]).read_bytes()
+
+
+def _decode(encoded: bytes, shape: tuple[int, ...], what: str) -> Frames:
+    grey = shape[2] == 1
+    flag = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR
+    image = cv2.imdecode(np.frombuffer(encoded, np.uint8), flag)
+    if image is None:
+        raise DatasetError(f"{what} cannot be decoded; check the dataset with hvs check")
+    image = image[..., None] if grey else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    if image.shape != shape:
+        raise DatasetError(f"{what} is {image.shape}, not {shape} as the dataset declares")
+    return np.asarray(image, np.uint8)

@@ -1,0 +1,246 @@
+"""What the network need not learn: the arm's kinematics, and where an image point lies in space.
+
+Fixed and differentiable. Everything is expressed in the base frame (metres, z up from the mounting
+plane) unless a name says otherwise; image coordinates (u, v) are in [-1, 1], u to the right, v
+down, 0 in the centre. The kinematics is that of the nominal robot on *measured* joints.
+"""
+
+import dataclasses
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from hvs_suite.cell.robot import FLANGE_HEIGHT_M, JOINT_AXES, JOINT_HEIGHTS_M
+
+FloatArray = npt.NDArray[np.float64]
+
+# Damping of the least-squares inverse: small against the arm's 0.4 m links, large enough to keep
+# steps bounded where the arm is stretched.
+DAMPING_M = 0.03
+# Offsets are shortened to this before the inverse, which only holds near the goal.
+LINEARISATION_RANGE_M = 0.10
+LINEARISATION_RANGE_RAD = 0.30
+# Least number of frames that show the target before a camera is calibrated from data.
+MIN_CALIBRATION_FRAMES = 60
+
+
+@dataclasses.dataclass(frozen=True)
+class FlangeMotion:
+    """Pose of the flange and how the joints move it.
+
+    Attributes:
+        position: Flange face centre, (B, 3) m.
+        rotation: Flange axes in the base frame as columns, (B, 3, 3).
+        jacobian: Linear over angular velocity in base axes per joint speed, (B, 6, 7).
+    """
+
+    position: Tensor
+    rotation: Tensor
+    jacobian: Tensor
+
+
+def flange_motion(q: Tensor) -> FlangeMotion:
+    """Forward kinematics as a product of seven joint rotations, all axes meeting the z line.
+
+    Args:
+        q: Joint angles, (B, 7) rad.
+
+    Returns:
+        Pose and geometric Jacobian of the flange.
+    """
+    rotation = torch.eye(3, dtype=q.dtype, device=q.device).expand(q.shape[0], 3, 3)
+    position = q.new_zeros(q.shape[0], 3)
+    origins, axes = [], []
+    height = 0.0
+    for i, (axis, joint_height) in enumerate(zip(JOINT_AXES, JOINT_HEIGHTS_M, strict=True)):
+        position = position + rotation[:, :, 2] * (joint_height - height)
+        height = joint_height
+        sign = float(sum(axis))
+        index = 2 if axis[2] else 1
+        origins.append(position)
+        axes.append(sign * rotation[:, :, index])
+        rotation = rotation @ _turn(index, sign * q[:, i])
+    position = position + rotation[:, :, 2] * (FLANGE_HEIGHT_M - height)
+    axis_stack = torch.stack(axes, dim=2)  # (B, 3, 7)
+    lever = position[:, :, None] - torch.stack(origins, dim=2)
+    linear = torch.linalg.cross(axis_stack, lever, dim=1)
+    return FlangeMotion(position, rotation, torch.cat([linear, axis_stack], dim=1))
+
+
+def _turn(index: int, angle: Tensor) -> Tensor:
+    """Rotation about the y (1) or z (2) axis, (B, 3, 3)."""
+    c, s = torch.cos(angle), torch.sin(angle)
+    zero, one = torch.zeros_like(c), torch.ones_like(c)
+    if index == 1:
+        rows = [c, zero, s, zero, one, zero, -s, zero, c]
+    else:
+        rows = [c, -s, zero, s, c, zero, zero, zero, one]
+    return torch.stack(rows, dim=1).view(-1, 3, 3)
+
+
+def joint_step(motion: FlangeMotion, offset: Tensor) -> Tensor:
+    """Damped least-squares step that puts the flange at an offset, facing straight down.
+
+    Solves ``J^T (J J^T + d^2 I)^-1 e`` with the three position rows and the two tilt rows of the
+    Jacobian; turning about the tool axis is free (Nakamura and Hanafusa, 1986).
+
+    Args:
+        motion: Where the flange is. No gradient flows through it.
+        offset: From the flange to where it should be, (B, 3) m, base frame.
+
+    Returns:
+        Joint step, (B, 7) rad.
+    """
+    with torch.no_grad():
+        tool = motion.rotation[:, :, 2]
+        down = torch.zeros_like(tool)
+        down[:, 2] = -1.0
+        axis = torch.linalg.cross(tool, down, dim=1)
+        sine = axis.norm(dim=1, keepdim=True)
+        angle = torch.atan2(sine, -tool[:, 2:])
+        tilt = axis * (angle.clamp(max=LINEARISATION_RANGE_RAD) / sine.clamp(min=1e-6))
+        into_flange = motion.rotation.transpose(1, 2)[:, :2]  # its x and y axes: yaw is free
+        # Angles weigh like the offsets they cause half a link away.
+        lever = 0.2
+        rows = torch.cat([motion.jacobian[:, :3], lever * into_flange @ motion.jacobian[:, 3:]], 1)
+        gram = rows @ rows.transpose(1, 2)
+        gram = gram + DAMPING_M**2 * torch.eye(5, dtype=gram.dtype, device=gram.device)
+        inverse = torch.linalg.solve(gram, rows).transpose(1, 2)  # (B, 7, 5)
+        tilt_in_flange = lever * (into_flange @ tilt[:, :, None])[:, :, 0]
+    length = offset.norm(dim=1, keepdim=True)
+    near = offset * (LINEARISATION_RANGE_M / length.clamp(min=LINEARISATION_RANGE_M))
+    error = torch.cat([near, tilt_in_flange], dim=1)
+    return (inverse @ error[:, :, None])[:, :, 0]
+
+
+def seen_from_hand(
+    motion: FlangeMotion, uv: Tensor, rays: Tensor, plane_height_m: Tensor
+) -> Tensor:
+    """Where the ray through an eye-in-hand image point meets the work surface.
+
+    Args:
+        motion: Pose of the flange, where the camera sits.
+        uv: Image coordinates, (B, 2).
+        rays: (3, 3); ``rays @ (u, v, 1)`` is the viewing direction in the flange frame.
+        plane_height_m: Height of the surface, scalar (m).
+
+    Returns:
+        (B, 4): the point (m), and 1 where the ray goes down to the surface within 1.5 m, else 0
+        (the point is then the one below the flange).
+    """
+    direction = (motion.rotation @ (_homogeneous(uv) @ rays.T)[:, :, None])[:, :, 0]
+    direction = direction / direction.norm(dim=1, keepdim=True).clamp(min=1e-6)
+    drop = plane_height_m - motion.position[:, 2]
+    reach = drop / direction[:, 2].clamp(max=-1e-3)
+    valid = ((direction[:, 2] < -0.05) & (reach < 1.5) & (reach > 0)).to(uv.dtype)[:, None]
+    below = torch.stack(
+        [motion.position[:, 0], motion.position[:, 1], plane_height_m.expand_as(drop)], dim=1
+    )
+    point = motion.position + reach.clamp(0.0, 1.5)[:, None] * direction
+    return torch.cat([torch.where(valid > 0, point, below), valid], dim=1)
+
+
+def seen_from_afar(uv: Tensor, homography: Tensor, plane_height_m: Tensor) -> Tensor:
+    """Where an eye-to-hand image point lies on the work surface.
+
+    Args:
+        uv: Image coordinates, (B, 2).
+        homography: (3, 3) from (u, v, 1) to (x, y, 1) up to scale.
+        plane_height_m: Height of the surface, scalar (m).
+
+    Returns:
+        The point, (B, 3) m.
+    """
+    mapped = _homogeneous(uv) @ homography.T
+    scale = mapped[:, 2:]
+    scale = torch.where(scale.abs() < 1e-3, torch.full_like(scale, 1e-3), scale)
+    xy = (mapped[:, :2] / scale).clamp(-2.0, 2.0)
+    return torch.cat([xy, plane_height_m.expand_as(xy[:, :1])], dim=1)
+
+
+def _homogeneous(uv: Tensor) -> Tensor:
+    return torch.cat([uv, torch.ones_like(uv[:, :1])], dim=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Calibration:
+    """Cameras and surface as the demonstrations show them.
+
+    Attributes:
+        rays: Eye-in-hand: (u, v, 1) to viewing direction in the flange frame, (3, 3).
+        homography: Eye-to-hand: (u, v, 1) to (x, y, 1) on the surface, (3, 3).
+        plane_height_m: Mean height of the targets (m).
+        standoff_m: Distance between flange face and target at the goal (m).
+    """
+
+    rays: FloatArray
+    homography: FloatArray
+    plane_height_m: float
+    standoff_m: float
+
+
+def calibrate(
+    q: FloatArray,
+    goal_position: FloatArray,
+    goal_normal: FloatArray,
+    standoff_m: float,
+    target_eih: FloatArray | None,
+    target_eth: FloatArray | None,
+) -> Calibration:
+    """Fit the camera maps to demonstrations by direct linear transformation.
+
+    A camera that never shows the target keeps a plain default, which the network can live with.
+
+    Args:
+        q: Measured joint angles, (n, 7) rad.
+        goal_position: Goal of the flange, (n, 3) m.
+        goal_normal: Outward surface normal at the target, (n, 3).
+        standoff_m: Distance between flange face and target at the goal (m).
+        target_eih: u, v, apparent diameter, visible for the eye-in-hand camera, (n, 4), or None.
+        target_eth: The same for the eye-to-hand camera, or None.
+
+    Returns:
+        The calibration.
+    """
+    target = goal_position - standoff_m * goal_normal
+    rays, homography = np.diag([0.7, 0.7, 1.0]), np.eye(3)
+    if target_eih is not None and (seen := _seen(target_eih)).sum() >= MIN_CALIBRATION_FRAMES:
+        motion = flange_motion(torch.from_numpy(np.asarray(q[seen], np.float64)))
+        offset = target[seen] - motion.position.numpy()
+        direction = np.einsum("nji,nj->ni", motion.rotation.numpy(), offset)
+        rays = _direct_linear(target_eih[seen, :2], direction)
+    if target_eth is not None and (seen := _seen(target_eth)).sum() >= MIN_CALIBRATION_FRAMES:
+        ones = np.ones((int(seen.sum()), 1))
+        homography = _direct_linear(
+            target_eth[seen, :2], np.concatenate([target[seen, :2], ones], axis=1)
+        )
+    return Calibration(rays, homography, float(target[:, 2].mean()), standoff_m)
+
+
+def _seen(target: FloatArray) -> npt.NDArray[np.bool_]:
+    return (target[:, 3] > 0.5) & (np.abs(target[:, :2]).max(axis=1) <= 1.0)
+
+
+def _direct_linear(uv: FloatArray, direction: FloatArray) -> FloatArray:
+    """Least-squares M with ``M @ (u, v, 1)`` parallel to ``direction`` (Hartley and Zisserman 4.1).
+
+    Args:
+        uv: (n, 2).
+        direction: (n, 3), its third component positive.
+
+    Returns:
+        (3, 3), scaled so that the last component is positive at (0, 0).
+    """
+    x = np.concatenate([uv, np.ones((len(uv), 1))], axis=1)
+    d = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    zero = np.zeros_like(x)
+    rows = np.concatenate(
+        [
+            np.concatenate([zero, -d[:, 2:] * x, d[:, 1:2] * x], axis=1),
+            np.concatenate([d[:, 2:] * x, zero, -d[:, :1] * x], axis=1),
+        ]
+    )
+    matrix = np.linalg.eigh(rows.T @ rows)[1][:, 0].reshape(3, 3)
+    return np.asarray(matrix / matrix[2, 2])

@@ -1,0 +1,156 @@
+"""The `hvs` network behind LeRobot's policy interface."""
+
+import json
+import logging
+from pathlib import Path
+from typing import Any, Unpack, cast
+
+import torch
+from lerobot.policies.pretrained import ActionSelectKwargs, PreTrainedPolicy
+from lerobot.utils.constants import ACTION, OBS_STATE
+from torch import Tensor
+
+from hvs_suite.policies.hvs.configuration_hvs import HvsConfig
+from hvs_suite.policies.hvs.network import (
+    IMAGE_PREFIX,
+    HvsNetwork,
+    action_loss,
+    sighting_loss,
+    target_loss,
+)
+
+GOAL_POSITION = "privileged.goal_position"
+GOAL_NORMAL = "privileged.goal_normal"
+TARGET_PREFIX = "privileged.target_"
+
+logger = logging.getLogger(__name__)
+
+
+class HvsPolicy(PreTrainedPolicy):  # type: ignore[misc]
+    """Two images and the joints in, seven joint position targets out.
+
+    Args:
+        config: Inputs and sizes.
+        dataset_meta: Given by LeRobot's factory: a new policy takes the camera calibration from
+            that dataset's privileged columns, if it has them.
+        **kwargs: What else LeRobot's factory passes; not used.
+    """
+
+    config_class = HvsConfig
+    name = "hvs"
+
+    def __init__(self, config: HvsConfig, dataset_meta: Any = None, **kwargs: Any) -> None:
+        super().__init__(config)
+        config.validate_features()
+        self.config: HvsConfig = config
+        self.network = HvsNetwork(config.shape())
+        self._warned = False
+        if dataset_meta is not None and not config.pretrained_path:
+            self._calibrate_from(Path(dataset_meta.root))
+
+    def _calibrate_from(self, root: Path) -> None:
+        from hvs_suite.errors import DatasetError
+        from hvs_suite.policies.demonstrations import calibration_of
+
+        try:
+            self.network.set_calibration(calibration_of(root))
+        except DatasetError as error:
+            logger.warning("no camera calibration from this dataset: %s", error)
+
+    def get_optim_params(self) -> Any:
+        """All parameters, in one group."""
+        return self.parameters()
+
+    def reset(self) -> None:
+        """Nothing to forget: the policy has no memory."""
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+        """Loss of a batch.
+
+        Args:
+            batch: The inputs, ``action`` (B, 7), and where the dataset has them
+                ``privileged.target_<camera>`` (B, 4), ``privileged.goal_position`` and
+                ``privileged.goal_normal`` (B, 3).
+
+        Returns:
+            The loss, and its parts as numbers.
+        """
+        images, state = self._inputs(batch)
+        out, sightings, target = self.network(images, state)
+        label = self.network.encode_label(batch[ACTION], state)
+        loss = action_loss(out, label)
+        parts = {"action_loss": loss.detach()}
+        weight = self.config.keypoint_weight
+        supervised = False
+        for camera, sighting in sightings.items():
+            truth = batch.get(TARGET_PREFIX + camera)
+            if weight > 0 and truth is not None:
+                part = sighting_loss(sighting, truth)
+                parts[f"{camera}_loss"] = part.detach()
+                loss = loss + weight * part
+                supervised = True
+        if weight > 0 and target is not None and GOAL_POSITION in batch and GOAL_NORMAL in batch:
+            truth = batch[GOAL_POSITION] - self.network.standoff * batch[GOAL_NORMAL]
+            part = target_loss(target, truth)
+            parts["target_loss"] = part.detach()
+            loss = loss + 0.1 * weight * part
+        if self.training and weight > 0 and not supervised and not self._warned:
+            logger.warning(
+                "training without keypoint supervision: the batch has no `privileged.target_*`"
+            )
+            self._warned = True
+        return loss, {name: float(part) for name, part in parts.items()}
+
+    @torch.no_grad()
+    def predict_action_chunk(
+        self, batch: dict[str, Tensor], **kwargs: Unpack[ActionSelectKwargs]
+    ) -> Tensor:
+        """Chunk of one action, (B, 1, 7) in [-1, 1]."""
+        self.eval()
+        images, state = self._inputs(batch)
+        out = self.network(images, state)[0]
+        return cast(Tensor, self.network.to_action(out, state))[:, None]
+
+    @torch.no_grad()
+    def select_action(
+        self, batch: dict[str, Tensor], **kwargs: Unpack[ActionSelectKwargs]
+    ) -> Tensor:
+        """Joint position targets in units of the joint range, (B, 7) in [-1, 1].
+
+        Args:
+            batch: Images (B, C, H, W) in [0, 1] and the state (B, 14) in rad and rad/s; other
+                keys are not looked at.
+            **kwargs: What LeRobot passes to policies with random actions; not used.
+
+        Returns:
+            The action.
+        """
+        return self.predict_action_chunk(batch)[:, 0]
+
+    def _inputs(self, batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor | None]:
+        images = {name: batch[IMAGE_PREFIX + name] for name in self.network.shape.cameras}
+        return images, batch[OBS_STATE] if self.network.shape.state_dim else None
+
+
+def save_checkpoint(policy: HvsPolicy, folder: Path) -> None:
+    """Write a checkpoint that LeRobot and the suite load, each file whole or not at all.
+
+    Args:
+        policy: The policy.
+        folder: Gets ``config.json``, ``model.safetensors`` and the two processors.
+    """
+    import tempfile
+
+    from hvs_suite.policies.hvs.processor_hvs import make_hvs_pre_post_processors
+
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".checkpoint-") as name:
+        scratch = Path(name)
+        policy.save_pretrained(scratch)
+        for processor in make_hvs_pre_post_processors(policy.config):
+            processor.save_pretrained(scratch)
+        # LeRobot reads the type before it knows the class; keep the file stable for diffs.
+        config = json.loads((scratch / "config.json").read_text())
+        (scratch / "config.json").write_text(json.dumps(config, indent=2, sort_keys=True) + "\n")
+        for path in sorted(scratch.iterdir()):
+            path.replace(folder / path.name)

@@ -1,0 +1,396 @@
+"""The `hvs` network in plain torch: two images and the joints in, a joint step out.
+
+Each camera has its own small convolutional encoder that ends in one *keypoint*: the softmax of one
+channel is a distribution over the image, its mean the target's centre. The keypoints are placed in
+space by fixed geometry, and a small perceptron turns joints and target into a joint step on a
+logarithmic scale, so that errors of a micrometre and of a metre both teach it something.
+
+No LeRobot in here: a rollout worker starts in the time torch takes to import.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
+from hvs_suite.policies.hvs import geometry
+from hvs_suite.policies.hvs.geometry import Calibration
+
+IMAGE_PREFIX = "observation.images."
+STATE = "observation.state"
+N_JOINTS = 7
+FEATURE_SIZE = 28
+"""Cells along the side of a feature map, about."""
+DELTA_SCALE_RAD = 0.005
+"""Joint steps are regressed as asinh(step / this): linear below, logarithmic above."""
+OFFSET_SCALE_M = 0.005
+POSITIONS_AND_VELOCITIES = 2 * N_JOINTS
+
+
+@dataclasses.dataclass(frozen=True)
+class Shape:
+    """Sizes that decide which weights there are.
+
+    Attributes:
+        cameras: Name (``eih``, ``eth``) to (channels, side in px), the eye in hand first.
+        state_dim: 14 for joint positions and velocities, 7 for positions alone, 0 for neither.
+        channels: Channels of the encoders.
+        hidden: Width of the perceptron.
+    """
+
+    cameras: Mapping[str, tuple[int, int]]
+    state_dim: int
+    channels: int
+    hidden: int
+
+
+def shape_from_config(config: Mapping[str, Any]) -> Shape:
+    """Read the sizes from a checkpoint's ``config.json``.
+
+    Args:
+        config: The parsed file.
+
+    Returns:
+        The sizes.
+
+    Raises:
+        KeyError: The file is not that of an `hvs` policy.
+    """
+    features = config["input_features"]
+    cameras = {
+        key.removeprefix(IMAGE_PREFIX): (int(value["shape"][0]), int(value["shape"][1]))
+        for key, value in sorted(features.items())
+        if key.startswith(IMAGE_PREFIX)
+    }
+    state_dim = int(features[STATE]["shape"][0]) if STATE in features else 0
+    return Shape(cameras, state_dim, int(config["channels"]), int(config["hidden"]))
+
+
+@dataclasses.dataclass(frozen=True)
+class Sighting:
+    """What one camera's encoder makes of its images.
+
+    Attributes:
+        uv: Centre of the target in [-1, 1], (B, 2).
+        log_diameter: Logarithm of the apparent diameter in image widths, (B, 1).
+        visible_logit: Logit that the target is in view, (B, 1).
+    """
+
+    uv: Tensor
+    log_diameter: Tensor
+    visible_logit: Tensor
+
+    def features(self) -> Tensor:
+        """Everything the head reads of it, (B, 4)."""
+        return torch.cat([self.uv, self.log_diameter, torch.tanh(self.visible_logit / 4.0)], dim=1)
+
+
+def strides(side: int) -> tuple[int, ...]:
+    """Strides of 4, 3 or 2 px that bring an image to about `FEATURE_SIZE` cells.
+
+    Args:
+        side: Side of the square image (px).
+
+    Returns:
+        Strides of the down-sampling convolutions; empty for tiny images.
+    """
+    factor = max(1, round(side / FEATURE_SIZE))
+    plan: list[int] = []
+    while factor > 1:
+        step = 3 if factor % 3 == 0 else 2
+        plan.append(step)
+        factor = round(factor / step)
+    return tuple(sorted(plan, reverse=True))
+
+
+class Eye(nn.Module):
+    """Encoder of one camera, ending in a keypoint.
+
+    Args:
+        in_channels: Channels of the image.
+        side: Side of the image (px).
+        channels: Channels of the features.
+
+    Attributes:
+        train_in_bfloat16: Train the convolutions in bfloat16, where the processor is faster at it.
+            Evaluation is always in float32, and so is everything that measures.
+    """
+
+    train_in_bfloat16 = False
+
+    def __init__(self, in_channels: int, side: int, channels: int) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        width = in_channels
+        plan = strides(side)
+        for i, stride in enumerate(plan):
+            out = channels if i == len(plan) - 1 else max(8, channels >> (len(plan) - 1 - i))
+            size = 5 if i == 0 else 3
+            layers += [nn.Conv2d(width, out, size, stride, size // 2), nn.ReLU(inplace=True)]
+            width = out
+        for _ in range(2):
+            layers += [nn.Conv2d(width, channels, 3, 1, 1), nn.ReLU(inplace=True)]
+            width = channels
+        self.features = nn.Sequential(*layers)
+        self.score = nn.Conv2d(channels, 1, 1)
+        # A mean over cells cannot reach the border, and strides shift it by a fraction of a cell.
+        self.uv_scale = nn.Parameter(torch.full((2,), 1.05))
+        self.uv_shift = nn.Parameter(torch.zeros(2))
+        self.size_and_visibility = nn.Sequential(
+            nn.Linear(2 * channels + 5, 64), nn.SiLU(), nn.Linear(64, 2)
+        )
+        nn.init.zeros_(self.size_and_visibility[2].weight)
+        with torch.no_grad():
+            self.size_and_visibility[2].bias.copy_(torch.tensor([math.log(0.15), 0.0]))
+
+    def forward(self, images: Tensor) -> Sighting:
+        """Find the target.
+
+        Args:
+            images: (B, C, H, W) in [0, 1].
+
+        Returns:
+            Where it is, how large, and whether it is there.
+        """
+        x = images.contiguous(memory_format=torch.channels_last) - 0.5
+        half = self.train_in_bfloat16 and self.training
+        with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=half):
+            maps = self.features(x)
+        maps = maps.float()
+        scores = self.score(maps)[:, 0]  # (B, h, w)
+        weights = torch.softmax(scores.flatten(1), dim=1)
+        grid = weights.view_as(scores)
+        u, u_spread = _moments(grid.sum(dim=1))
+        v, v_spread = _moments(grid.sum(dim=2))
+        filled = torch.sigmoid(scores).mean(dim=(1, 2), keepdim=True)[:, :, 0].clamp(min=1e-6)
+        uv = torch.cat([u, v], dim=1)
+        flat = maps.flatten(2)
+        pooled = torch.cat(
+            [
+                (flat * weights[:, None]).sum(dim=2),
+                flat.amax(dim=2),
+                u_spread,
+                v_spread,
+                filled.sqrt(),
+                uv.abs(),
+            ],
+            dim=1,
+        )
+        size, visible = self.size_and_visibility(pooled).split(1, dim=1)
+        return Sighting(uv * self.uv_scale + self.uv_shift, size, visible)
+
+
+def _moments(marginal: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation in [-1, 1] of a distribution over n cells, (B, 1) each."""
+    n = marginal.shape[1]
+    centres = (2.0 * torch.arange(n, device=marginal.device, dtype=marginal.dtype) + 1.0) / n - 1.0
+    mean = (marginal * centres).sum(dim=1, keepdim=True)
+    variance = (marginal * centres**2).sum(dim=1, keepdim=True) - mean**2
+    return mean, variance.clamp(min=1e-8).sqrt()
+
+
+class HvsNetwork(nn.Module):
+    """Eyes, geometry and head.
+
+    Args:
+        shape: Sizes.
+    """
+
+    joint_range: Tensor
+    joint_speed: Tensor
+    rays: Tensor
+    homography: Tensor
+    plane_height: Tensor
+    standoff: Tensor
+
+    def __init__(self, shape: Shape) -> None:
+        super().__init__()
+        self.shape = shape
+        self.eyes = nn.ModuleDict(
+            {name: Eye(c, side, shape.channels) for name, (c, side) in shape.cameras.items()}
+        )
+        range_rad = torch.tensor(JOINT_RANGE_RAD, dtype=torch.float32)
+        self.register_buffer("joint_range", range_rad, persistent=False)
+        speed_rad_s = torch.tensor(JOINT_SPEED_RAD_S, dtype=torch.float32)
+        self.register_buffer("joint_speed", speed_rad_s, persistent=False)
+        self.register_buffer("rays", torch.diag(torch.tensor([0.7, 0.7, 1.0])))
+        self.register_buffer("homography", torch.eye(3))
+        self.register_buffer("plane_height", torch.tensor(0.0))
+        self.register_buffer("standoff", torch.tensor(0.05))
+        n_cameras = len(shape.cameras)
+        width = 4 * n_cameras
+        if shape.state_dim:
+            width += 3 * N_JOINTS + 12 + 7 * (n_cameras + (n_cameras > 1)) + N_JOINTS
+            if shape.state_dim == POSITIONS_AND_VELOCITIES:
+                width += N_JOINTS
+        hidden = shape.hidden
+        self.head = nn.Sequential(
+            nn.Linear(width, hidden),
+            nn.SiLU(),
+            nn.Linear(hidden, hidden),
+            nn.SiLU(),
+            nn.Linear(hidden, hidden),
+            nn.SiLU(),
+            nn.Linear(hidden, N_JOINTS),
+        )
+        last = self.head[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.zeros_(last.bias)
+        with torch.no_grad():
+            last.weight.mul_(0.1)
+        # How far to trust the eye in hand over the eye to hand, from what both see.
+        self.trust = nn.Linear(4 * n_cameras + 1, 1) if n_cameras > 1 and shape.state_dim else None
+        self.step_gain = nn.Parameter(torch.full((N_JOINTS,), 0.5))
+
+    def set_calibration(self, calibration: Calibration) -> None:
+        """Copy camera maps and surface into the buffers that are saved with the weights."""
+        self.rays.copy_(torch.from_numpy(calibration.rays))
+        self.homography.copy_(torch.from_numpy(calibration.homography))
+        self.plane_height.fill_(calibration.plane_height_m)
+        self.standoff.fill_(calibration.standoff_m)
+
+    def look(self, images: Mapping[str, Tensor]) -> dict[str, Sighting]:
+        """Run the eyes.
+
+        Args:
+            images: Camera name to (B, C, H, W) in [0, 1].
+
+        Returns:
+            Camera name to what it saw.
+        """
+        return {name: eye(images[name]) for name, eye in self.eyes.items()}
+
+    def forward(
+        self, images: Mapping[str, Tensor], state: Tensor | None
+    ) -> tuple[Tensor, dict[str, Sighting], Tensor | None]:
+        """Decide.
+
+        Args:
+            images: Camera name to (B, C, H, W) in [0, 1].
+            state: Measured joint positions (rad), then velocities (rad/s), (B, 14) or (B, 7);
+                None if the policy has no joint inputs.
+
+        Returns:
+            The head's output, (B, 7) (see `to_action`), what each camera saw, and the estimated
+            target, (B, 3) m in the base frame (None without joints).
+        """
+        # Half a millimetre at the flange is 1e-3 rad: nothing here may be rounded by autocast.
+        with torch.autocast(self.joint_range.device.type, enabled=False):
+            return self._decide(images, state)
+
+    def _decide(
+        self, images: Mapping[str, Tensor], state: Tensor | None
+    ) -> tuple[Tensor, dict[str, Sighting], Tensor | None]:
+        sightings = self.look(images)
+        features = [s.features() for s in sightings.values()]
+        if state is None:
+            return self.head(torch.cat(features, dim=1)), sightings, None
+        q = state[:, :N_JOINTS]
+        motion = geometry.flange_motion(q)
+        target, estimates = self._place(motion, sightings)
+        lift = torch.zeros_like(target)
+        lift[:, 2] = self.standoff
+        step = torch.asinh(
+            geometry.joint_step(motion, target + lift - motion.position) / DELTA_SCALE_RAD
+        )
+        features += [torch.sin(q), torch.cos(q), q / self.joint_range]
+        features += [motion.position, motion.rotation.flatten(1), step]
+        if self.shape.state_dim == POSITIONS_AND_VELOCITIES:
+            features.append(state[:, N_JOINTS:] / self.joint_speed)
+        for estimate in estimates:
+            offset = estimate[:, :3] + lift - motion.position
+            in_flange = (offset[:, None] @ motion.rotation)[:, 0]
+            features += [offset, torch.asinh(in_flange / OFFSET_SCALE_M), estimate[:, 3:]]
+        out = self.head(torch.cat(features, dim=1)) + self.step_gain * step
+        return out, sightings, target
+
+    def _place(
+        self, motion: geometry.FlangeMotion, sightings: Mapping[str, Sighting]
+    ) -> tuple[Tensor, list[Tensor]]:
+        """Put the target into space.
+
+        Returns:
+            The best estimate (B, 3) m, and every estimate with its weight, (B, 4) each.
+        """
+        estimates = []
+        for name, sighting in sightings.items():
+            confidence = torch.sigmoid(sighting.visible_logit)
+            if name == "eih":
+                point = geometry.seen_from_hand(motion, sighting.uv, self.rays, self.plane_height)
+                estimates.append(torch.cat([point[:, :3], point[:, 3:] * confidence], dim=1))
+            else:
+                point = geometry.seen_from_afar(sighting.uv, self.homography, self.plane_height)
+                estimates.append(torch.cat([point, confidence], dim=1))
+        if self.trust is None:
+            return estimates[0][:, :3], estimates
+        seen = [s.features() for s in sightings.values()]
+        near = estimates[0][:, 3:]  # the eye in hand comes first
+        logit = self.trust(torch.cat([*seen, near], dim=1)) + 8.0 * (near - 0.5)
+        share = torch.sigmoid(logit)
+        best = share * estimates[0][:, :3] + (1.0 - share) * estimates[1][:, :3]
+        return best, [*estimates, torch.cat([best, share], dim=1)]
+
+    def to_action(self, out: Tensor, state: Tensor | None) -> Tensor:
+        """Decode the head's output.
+
+        Args:
+            out: (B, 7).
+            state: As in `forward`.
+
+        Returns:
+            Joint position targets in units of the joint range, (B, 7) in [-1, 1].
+        """
+        if state is None:
+            return out.clamp(-1.0, 1.0)
+        target = state[:, :N_JOINTS] + DELTA_SCALE_RAD * torch.sinh(out.clamp(-8.0, 8.0))
+        return (target / self.joint_range).clamp(-1.0, 1.0)
+
+    def encode_label(self, action: Tensor, state: Tensor | None) -> Tensor:
+        """Inverse of `to_action` without the clipping: what the head should have said.
+
+        Args:
+            action: The expert's joint position targets in units of the joint range, (B, 7).
+            state: As in `forward`.
+
+        Returns:
+            (B, 7).
+        """
+        if state is None:
+            return action
+        step = action * self.joint_range - state[:, :N_JOINTS]
+        return torch.asinh(step / DELTA_SCALE_RAD)
+
+
+def action_loss(out: Tensor, label: Tensor) -> Tensor:
+    """Huber loss between the head's output and the encoded label, both (B, 7)."""
+    return F.smooth_l1_loss(out, label, beta=0.3)
+
+
+def target_loss(target: Tensor, truth: Tensor) -> Tensor:
+    """Loss of the target's place in space, logarithmic beyond `OFFSET_SCALE_M`, both (B, 3) m."""
+    return torch.asinh((target - truth).abs() / OFFSET_SCALE_M).mean()
+
+
+def sighting_loss(sighting: Sighting, truth: Tensor) -> Tensor:
+    """Loss of a camera against the projected target.
+
+    Args:
+        sighting: What the camera saw.
+        truth: u, v, apparent diameter in image widths, visible 0/1, (B, 4).
+
+    Returns:
+        Scalar: centre and size where the target is in view, and the visibility everywhere.
+    """
+    visible = truth[:, 3:]
+    inside = visible * (truth[:, :2].abs().amax(dim=1, keepdim=True) <= 1.1)
+    count = inside.sum().clamp(min=1.0)
+    centre = F.smooth_l1_loss(sighting.uv, truth[:, :2], beta=0.01, reduction="none")
+    log_diameter = truth[:, 2:3].clamp(min=1e-3).log()
+    size = F.smooth_l1_loss(sighting.log_diameter, log_diameter, beta=0.1, reduction="none")
+    known = F.binary_cross_entropy_with_logits(sighting.visible_logit, visible)
+    return (10.0 * centre * inside).sum() / count + (size * inside).sum() / count + 0.3 * known

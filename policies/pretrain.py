@@ -1,0 +1,473 @@
+"""Behaviour cloning: trains the `hvs` policy on a recorded dataset.
+
+The loss is that of `HvsPolicy.forward`: the expert's joint step on a logarithmic scale, and the
+projected target as seen by each camera. A run is a function of dataset, seed and number of steps;
+killed, it goes on from its last checkpoint when the same command is given again.
+"""
+
+import dataclasses
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from hvs_suite.errors import OptionError, OutputError
+from hvs_suite.files import check_writable, replacing
+from hvs_suite.policies.demonstrations import (
+    Demonstrations,
+    Manifest,
+    calibration_of,
+    read_manifest,
+    refuse_test_split,
+)
+from hvs_suite.policies.frame_cache import fingerprint
+from hvs_suite.policies.hvs.network import IMAGE_PREFIX, STATE, Eye
+from hvs_suite.policies.training_state import Counters, load_state, save_state
+
+if TYPE_CHECKING:
+    from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
+
+WARMUP_SHARE = 0.03
+GRADIENT_NORM = 1.0
+# Philox words that keep this stream apart from the held-out choice.
+ORDER_STREAM = 2
+HELD_OUT_BATCH = 128
+HELD_OUT_FRAMES = 512
+LOG_EVERY_STEPS = 20
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """How a run is doing.
+
+    Attributes:
+        stage: ``decoding`` or ``training``.
+        share: Part of the stage that is done, 0 to 1.
+        step: Optimiser steps done.
+        frames: Frames decoded or trained on in this sitting.
+        frames_per_s: Rate of that.
+        seconds_left: Of this stage, at this rate (s).
+        loss: Mean training loss of the last steps; NaN while decoding.
+        held_out_loss: Last measured on held-out episodes; NaN before.
+    """
+
+    stage: str
+    share: float
+    step: int
+    frames: int
+    frames_per_s: float
+    seconds_left: float
+    loss: float
+    held_out_loss: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What a run came to; also in ``training/outcome.json``.
+
+    Attributes:
+        step: Optimiser steps, over all sittings.
+        train_s: Training time, over all sittings (s).
+        decode_s: Time spent decoding frames in this sitting (s).
+        data_s: Part of the training time of this sitting spent waiting for batches (s).
+        frames_per_s: Frames trained on a second in this sitting.
+        loss: Mean training loss of the last steps.
+        held_out_loss: Loss on held-out episodes at the end; NaN if there are none.
+        n_parameters: Trainable numbers of the policy.
+    """
+
+    step: int
+    train_s: float
+    decode_s: float
+    data_s: float
+    frames_per_s: float
+    loss: float
+    held_out_loss: float
+    n_parameters: int
+
+
+def pretrain(
+    data: Path,
+    out: Path,
+    *,
+    minutes: float | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    batch_size: int = 64,
+    learning_rate: float = 2e-3,
+    checkpoint_period_s: float = 60.0,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> Outcome:
+    """Train the `hvs` policy on a dataset, or go on with a run that was interrupted.
+
+    Args:
+        data: Root of the dataset; its ``hvs.json`` names the task.
+        out: Folder for the checkpoint, which loads with ``from_pretrained``; the training state
+            lives in ``out/training``.
+        minutes: Stop after this much training, decoding not counted (min).
+        steps: Stop after this many optimiser steps. Give either, or both for the first reached.
+        seed: Of initial weights, held-out episodes and order.
+        batch_size: Frames a step.
+        learning_rate: Peak of the schedule (a short warm-up, then a cosine to zero).
+        checkpoint_period_s: Time between checkpoints (s).
+        on_progress: Called while decoding and after every step.
+
+    Returns:
+        What the run came to.
+
+    Raises:
+        DatasetError: The dataset cannot be trained on, or was recorded on ``test``.
+        OptionError: No budget, or a number that makes no sense.
+        OutputError: ``out`` cannot be written, or holds something else than this run.
+    """
+    _check_options(minutes, steps, batch_size, learning_rate)
+    manifest = read_manifest(data)
+    refuse_test_split(manifest)
+    torch.set_num_threads(min(2, os.cpu_count() or 1))
+    settings: dict[str, Any] = {
+        "seed": seed,
+        "batch_size": batch_size,
+        "learning_rate": learning_rate,
+        "dataset": fingerprint(data),
+        "task": manifest.task,
+    }
+    _claim(out, settings)
+    training = out / "training"
+    policy = _new_policy(manifest, seed, learning_rate)
+    _write_config(out, data, settings, minutes, steps, policy)
+    run = _Run(out, on_progress)
+    demonstrations = run.decode(manifest, training / "cache", seed)
+    run.train(
+        policy,
+        demonstrations,
+        seed=seed,
+        batch_size=batch_size,
+        learning_rate=learning_rate,
+        budget=_Budget(steps, None if minutes is None else 60.0 * minutes),
+        checkpoint_period_s=checkpoint_period_s,
+    )
+    outcome = run.outcome(policy)
+    with replacing(training / "outcome.json") as temporary:
+        temporary.write_text(json.dumps(dataclasses.asdict(outcome), indent=2) + "\n")
+    return outcome
+
+
+@dataclasses.dataclass(frozen=True)
+class _Budget:
+    """How long to train: steps, seconds, or whichever is reached first."""
+
+    steps: int | None
+    seconds: float | None
+
+    def share(self, counters: Counters) -> float:
+        """Part that is used up, 1 at the end."""
+        shares = [0.0]
+        if self.steps is not None:
+            shares.append(counters.step / self.steps)
+        if self.seconds is not None:
+            shares.append(counters.elapsed_s / self.seconds)
+        return max(shares)
+
+
+class _Run:
+    """One sitting of a training run: clocks, reports and checkpoints around the loop."""
+
+    def __init__(self, out: Path, on_progress: Callable[[Progress], None] | None) -> None:
+        self._out = out
+        self._on_progress = on_progress
+        self._decode_s = 0.0
+        self._data_s = 0.0
+        self._frames = 0
+        self._sitting_s = 0.0
+        self._counters = Counters()
+        self._loss = math.nan
+        self._held_out_loss = math.nan
+
+    def decode(self, manifest: Manifest, cache: Path, seed: int) -> Demonstrations:
+        """Open the dataset, decoding its frames unless the cache has them."""
+        total = manifest.n_frames * max(1, len(manifest.cameras))
+        started = time.perf_counter()
+        done = 0
+
+        def note(count: int) -> None:
+            nonlocal done
+            done += count
+            rate = done / max(1e-9, time.perf_counter() - started)
+            self._report("decoding", done / total, done, rate, (total - done) / rate)
+
+        demonstrations = Demonstrations(manifest, cache, seed, note)
+        self._decode_s = time.perf_counter() - started
+        return demonstrations
+
+    def train(
+        self,
+        policy: "HvsPolicy",
+        demonstrations: Demonstrations,
+        *,
+        seed: int,
+        batch_size: int,
+        learning_rate: float,
+        budget: _Budget,
+        checkpoint_period_s: float,
+    ) -> None:
+        """Train until the budget is used up; the last checkpoint is the final one."""
+        from torch.utils.tensorboard import SummaryWriter
+
+        state = self._out / "training" / "state.safetensors"
+        decay = policy.config.optimizer_weight_decay
+        optimizer = torch.optim.AdamW(policy.parameters(), lr=learning_rate, weight_decay=decay)
+        self._counters = load_state(state, policy, optimizer)
+        order = _Order(demonstrations.training, batch_size, seed)
+        before_s = self._counters.elapsed_s
+        begun = budget.share(self._counters)
+        started = last_checkpoint = time.perf_counter()
+        recent: list[float] = []
+        policy.train()
+        writer = SummaryWriter(
+            str(self._out / "training" / "tensorboard"), purge_step=self._counters.step
+        )
+        try:
+            while (share := budget.share(self._counters)) < 1.0:
+                step = self._counters.step
+                for group in optimizer.param_groups:
+                    group["lr"] = learning_rate * _schedule(share)
+                fetched = time.perf_counter()
+                batch = demonstrations.batch(order.indices(step))
+                self._data_s += time.perf_counter() - fetched
+                loss, parts = policy(batch)
+                optimizer.zero_grad()
+                loss.backward()
+                torch.nn.utils.clip_grad_norm_(policy.parameters(), GRADIENT_NORM)
+                optimizer.step()
+
+                recent = [*recent[1 - LOG_EVERY_STEPS :], float(loss)]
+                self._loss = sum(recent) / len(recent)
+                self._frames += batch_size
+                now = time.perf_counter()
+                self._sitting_s = now - started
+                self._counters = Counters(step + 1, before_s + self._sitting_s)
+                if self._counters.step % LOG_EVERY_STEPS == 0:
+                    _log(writer, self._counters.step, {"loss": self._loss, **parts})
+                    writer.add_scalar("learning_rate", group["lr"], self._counters.step)
+                if now - last_checkpoint >= checkpoint_period_s:
+                    self._checkpoint(policy, optimizer, demonstrations, state, writer)
+                    last_checkpoint = time.perf_counter()
+                self._report_training(budget.share(self._counters), begun)
+            self._checkpoint(policy, optimizer, demonstrations, state, writer)
+        finally:
+            writer.close()
+
+    def outcome(self, policy: "HvsPolicy") -> Outcome:
+        """What the sitting came to."""
+        return Outcome(
+            step=self._counters.step,
+            train_s=self._counters.elapsed_s,
+            decode_s=self._decode_s,
+            data_s=self._data_s,
+            frames_per_s=self._frames / max(1e-9, self._sitting_s),
+            loss=self._loss,
+            held_out_loss=self._held_out_loss,
+            n_parameters=sum(p.numel() for p in policy.parameters()),
+        )
+
+    def _checkpoint(
+        self,
+        policy: "HvsPolicy",
+        optimizer: torch.optim.Optimizer,
+        demonstrations: Demonstrations,
+        state: Path,
+        writer: Any,
+    ) -> None:
+        from hvs_suite.policies.hvs.modeling_hvs import save_checkpoint
+
+        parts = _held_out(policy, demonstrations)
+        self._held_out_loss = parts.get("loss", math.nan)
+        _log(writer, self._counters.step, {f"held_out/{name}": v for name, v in parts.items()})
+        save_state(state, policy, optimizer, self._counters)
+        save_checkpoint(policy, self._out)
+
+    def _report_training(self, share: float, begun: float) -> None:
+        """Report, with the time left if the budget goes on shrinking at this sitting's rate."""
+        rate = (share - begun) / self._sitting_s
+        left = max(0.0, 1.0 - share) / rate
+        self._report("training", share, self._frames, self._frames / self._sitting_s, left)
+
+    def _report(
+        self, stage: str, share: float, frames: int, rate: float, seconds_left: float
+    ) -> None:
+        if self._on_progress is None:
+            return
+        self._on_progress(
+            Progress(
+                stage=stage,
+                share=share,
+                step=self._counters.step,
+                frames=frames,
+                frames_per_s=rate,
+                seconds_left=seconds_left,
+                loss=self._loss,
+                held_out_loss=self._held_out_loss,
+            )
+        )
+
+
+class _Order:
+    """Which frames each step learns from: shuffled passes, a function of seed and step alone."""
+
+    def __init__(self, indices: npt.NDArray[np.int64], batch_size: int, seed: int) -> None:
+        self._pool = indices
+        self._batch_size = batch_size
+        self._seed = seed
+        self._pass = -1
+        self._shuffled = indices
+
+    def indices(self, step: int) -> npt.NDArray[np.int64]:
+        """Frames of a step, (batch_size,); a batch may run over the end of a pass."""
+        first = step * self._batch_size
+        positions = np.arange(first, first + self._batch_size)
+        passes = positions // len(self._pool)
+        within = positions % len(self._pool)
+        chosen = np.empty(self._batch_size, np.int64)
+        for number in np.unique(passes):
+            mask = passes == number
+            chosen[mask] = self._permutation(int(number))[within[mask]]
+        return chosen
+
+    def _permutation(self, number: int) -> npt.NDArray[np.int64]:
+        if number != self._pass:
+            key = np.random.Philox(key=[self._seed, ORDER_STREAM], counter=number)
+            self._shuffled = np.random.Generator(key).permutation(self._pool)
+            self._pass = number
+        return self._shuffled
+
+
+def _schedule(share: float) -> float:
+    """Learning rate as a share of its peak: linear warm-up, then half a cosine to zero."""
+    warm = min(1.0, (share + 1e-3) / WARMUP_SHARE)
+    return warm * 0.5 * (1.0 + math.cos(math.pi * min(1.0, share)))
+
+
+def _held_out(policy: "HvsPolicy", demonstrations: Demonstrations) -> dict[str, float]:
+    """Mean losses over held-out frames spread over their episodes; empty if there are none."""
+    indices = demonstrations.held_out
+    if not len(indices):
+        return {}
+    spread = np.linspace(0, len(indices) - 1, min(len(indices), HELD_OUT_FRAMES))
+    indices = indices[spread.astype(np.int64)]
+    sums: dict[str, float] = {}
+    policy.eval()
+    with torch.no_grad():
+        for first in range(0, len(indices), HELD_OUT_BATCH):
+            part = indices[first : first + HELD_OUT_BATCH]
+            loss, parts = policy(demonstrations.batch(part))
+            for name, value in {"loss": float(loss), **parts}.items():
+                sums[name] = sums.get(name, 0.0) + value * len(part)
+    policy.train()
+    return {name: value / len(indices) for name, value in sums.items()}
+
+
+def _new_policy(manifest: Manifest, seed: int, learning_rate: float) -> "HvsPolicy":
+    """A fresh policy for a dataset's inputs, its cameras calibrated from the dataset."""
+    from lerobot.configs import FeatureType, PolicyFeature
+
+    from hvs_suite.policies.hvs.configuration_hvs import HvsConfig
+    from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
+
+    inputs = {
+        IMAGE_PREFIX + name: PolicyFeature(FeatureType.VISUAL, (shape[2], shape[0], shape[1]))
+        for name, shape in manifest.cameras.items()
+    }
+    if STATE in manifest.features:
+        shape = tuple(manifest.features[STATE]["shape"])
+        inputs[STATE] = PolicyFeature(FeatureType.STATE, shape)
+    config = HvsConfig(
+        input_features=inputs,
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},
+        device="cpu",
+        push_to_hub=False,
+        optimizer_lr=learning_rate,
+    )
+    # torch initialises weights from its global generator; leave that as it was found.
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        policy = HvsPolicy(config)
+    if STATE in manifest.features:
+        policy.network.set_calibration(calibration_of(manifest.root))
+    for module in policy.modules():
+        if isinstance(module, Eye):
+            module.train_in_bfloat16 = torch.cpu._is_avx512_bf16_supported()
+    return policy
+
+
+def _check_options(
+    minutes: float | None, steps: int | None, batch_size: int, learning_rate: float
+) -> None:
+    if minutes is None and steps is None:
+        raise OptionError("say how long to train: give minutes or steps")
+    for name, value in (("minutes", minutes), ("steps", steps)):
+        if value is not None and not (value > 0 and math.isfinite(value)):
+            raise OptionError(f"{name} must be above 0, not {value}")
+    if batch_size < 1:
+        raise OptionError(f"batch_size must be at least 1, not {batch_size}")
+    if not 0.0 < learning_rate < 1.0:
+        raise OptionError(f"learning_rate must be between 0 and 1, not {learning_rate}")
+
+
+def _claim(out: Path, settings: Mapping[str, Any]) -> None:
+    """Take the folder, or recognise it as an interrupted run with the same settings."""
+    config = out / "train_config.json"
+    check_writable(config)
+    try:
+        begun = json.loads(config.read_text())["settings"]
+    except OSError:
+        if any(out.iterdir()):
+            raise OutputError(f"{out} is not empty; name another --out") from None
+        return
+    except (ValueError, KeyError, TypeError):
+        raise OutputError(f"{config} is damaged; name another --out") from None
+    differing = sorted(k for k in settings if begun.get(k) != settings[k])
+    if differing:
+        raise OutputError(
+            f"{out} holds a run with another {', '.join(differing)}; name another --out"
+        )
+
+
+def _write_config(
+    out: Path,
+    data: Path,
+    settings: Mapping[str, Any],
+    minutes: float | None,
+    steps: int | None,
+    policy: "HvsPolicy",
+) -> None:
+    from importlib.metadata import version
+
+    content = {
+        "format": 1,
+        "data": str(data),
+        "settings": settings,
+        "budget": {"minutes": minutes, "steps": steps},
+        "policy": {
+            "type": "hvs",
+            "channels": policy.config.channels,
+            "hidden": policy.config.hidden,
+            "keypoint_weight": policy.config.keypoint_weight,
+            "weight_decay": policy.config.optimizer_weight_decay,
+        },
+        "versions": {name: version(name) for name in ("hvs-suite", "lerobot", "numpy", "torch")},
+        "threads": torch.get_num_threads(),
+    }
+    with replacing(out / "train_config.json") as temporary:
+        temporary.write_text(json.dumps(content, indent=2) + "\n")
+
+
+def _log(writer: Any, step: int, values: Mapping[str, float]) -> None:
+    for name, value in values.items():
+        writer.add_scalar(name if "/" in name else f"train/{name}", value, step)
