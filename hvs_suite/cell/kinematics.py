@@ -258,7 +258,7 @@ class Kinematics:
         shapes = shapes[(np.abs(shapes[:, :6]) <= robot.JOINT_RANGE_RAD[:6]).all(axis=1)]
         q = np.repeat(shapes, n_yaw, axis=0)
         q[:, 6] = _wrap(q[:, 6] + np.tile(_circle(n_yaw), len(shapes)))
-        return q[np.abs(q[:, 6]) <= robot.JOINT_RANGE_RAD[6]]
+        return np.asarray(q[np.abs(q[:, 6]) <= robot.JOINT_RANGE_RAD[6]])
 
     def goal_configurations_at_tool_angle(
         self,
@@ -327,7 +327,7 @@ class Kinematics:
 
 def _circle(n: int) -> FloatArray:
     """Angles (n,) in rad, evenly spaced over the full circle from 0."""
-    return np.arange(n) * (2.0 * np.pi / n)
+    return np.arange(n, dtype=np.float64) * (2.0 * np.pi / n)
 
 
 def _within_ranges(q: FloatArray) -> FloatArray:

@@ -103,7 +103,8 @@ def _turned(
     """
     mesh = trimesh.creation.revolve(np.array(profile), sections=sides)
     if axis == "y":
-        mesh.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2.0, [1, 0, 0]))
+        turn = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+        mesh.apply_transform(turn)
     mesh.apply_translation(centre)
     if mesh.volume < 0.0:
         mesh.invert()
