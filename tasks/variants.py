@@ -358,7 +358,7 @@ _ALL = (
         tilt_tolerance_deg=0.4,
         hold_steps=5,
         eih_resolution=224,
-        eth_resolution=448,
+        eth_resolution=512,
         joint_offset_deg=0.05,
         latency_steps=1,
     ),
