@@ -13,7 +13,7 @@ from hvs_suite.eval.board_tables import (
     overall,
     percent,
 )
-from hvs_suite.eval.results import Result
+from hvs_suite.eval.result_file import Result
 
 STYLE = """
 :root { color-scheme: light dark; --paper: #faf9f7; --card: #fff; --ink: #1c1e21; --soft: #63676d;

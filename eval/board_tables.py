@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 
-from hvs_suite.eval.results import Result
+from hvs_suite.eval.result_file import Result
 from hvs_suite.tasks.variants import TASKS
 
 NOTE = (

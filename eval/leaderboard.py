@@ -12,7 +12,7 @@ from pathlib import Path
 
 from hvs_suite import files, registry
 from hvs_suite.errors import HvsError, ResultError
-from hvs_suite.eval import results
+from hvs_suite.eval import result_file
 from hvs_suite.eval.board_page import page
 from hvs_suite.eval.board_tables import Entry, markdown
 
@@ -61,7 +61,7 @@ def collect(results_folder: Path) -> list[Entry]:
         policy, *rest = path.relative_to(results_folder).parts
         if len(rest) != 1:
             raise ResultError(f"{path}: results lie as {results_folder}/<policy>/<task>.json")
-        entry = Entry(policy, results.load(path))
+        entry = Entry(policy, result_file.load(path))
         variant = registry.find(entry.result.summary.task)
         if entry.result.metadata.task_version != variant.version:
             raise ResultError(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from hvs_suite import registry, rollout
 from hvs_suite.errors import OptionError, ScenarioError
-from hvs_suite.eval import provenance, results
+from hvs_suite.eval import provenance, result_file
 from hvs_suite.policies.catalogue import policy_factory
 from hvs_suite.tasks import lock
 from hvs_suite.tasks.scenario import TEST_SCENARIOS, TEST_SPLIT
@@ -39,7 +39,7 @@ def evaluate(
     episodes: int = TEST_SCENARIOS,
     workers: int = 1,
     progress: Callable[[rollout.Episode], None] | None = None,
-) -> results.Result:
+) -> result_file.Result:
     """Scores a policy on the first scenarios of a split.
 
     Args:
@@ -77,26 +77,27 @@ def evaluate(
     )
     wall_s = time.perf_counter() - started
     steps = sum(episode.steps for episode in played)
-    rows = [results.EpisodeRow.of(episode) for episode in played]
-    folder = Path(policy)
+    rows = [result_file.EpisodeRow.of(episode) for episode in played]
+    # A policy that comes from a checkpoint, shipped or not, knows its folder.
+    checkpoint: str | None = getattr(make_policy, "folder", None)
     # An absolute path would tell who ran it and where.
-    name = folder.name if folder.is_absolute() else policy
-    return results.Result(
-        schema_version=results.SCHEMA_VERSION,
-        summary=results.Summary.of(task, name, split, rows),
-        metadata=results.Metadata(
+    name = Path(policy).name if Path(policy).is_absolute() else policy
+    return result_file.Result(
+        schema_version=result_file.SCHEMA_VERSION,
+        summary=result_file.Summary.of(task, name, split, rows),
+        metadata=result_file.Metadata(
             created=created,
             suite_version=provenance.suite_version(),
             task_version=variant.version,
             task_digest=lock.digest(task),
             options={},
-            policy_hash=provenance.checkpoint_hash(folder) if folder.is_dir() else None,
+            policy_hash=provenance.checkpoint_hash(Path(checkpoint)) if checkpoint else None,
             packages=provenance.package_versions(),
             gl_renderer=renderer,
             cpu=provenance.cpu(),
             platform=provenance.operating_system(),
         ),
-        timings=results.Timings(
+        timings=result_file.Timings(
             workers=workers,
             wall_s=wall_s,
             steps_per_s=steps / wall_s,

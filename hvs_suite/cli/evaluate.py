@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from hvs_suite.cli import console
 
 if TYPE_CHECKING:
-    from hvs_suite.eval.results import Result
+    from hvs_suite.eval.result_file import Result
     from hvs_suite.rollout import Episode
 
 
@@ -34,7 +34,7 @@ class Evaluate:
     def run(self) -> int:
         """Evaluate, write the result, print its summary."""
         from hvs_suite import files
-        from hvs_suite.eval import protocol, results
+        from hvs_suite.eval import protocol, result_file
 
         files.check_writable(self.out)
         n_played = n_success = 0
@@ -49,7 +49,7 @@ class Evaluate:
             result = protocol.evaluate(
                 self.policy, self.task, self.split, self.episodes, self.workers, progress=note
             )
-        results.write(result, self.out)
+        result_file.write(result, self.out)
         _print_summary(result)
         print(f"Written to {self.out}")
         return 0

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_results import make_result
+from test_result_file import make_result
 
 from hvs_suite.errors import OutputError, ResultError
-from hvs_suite.eval import leaderboard, results
+from hvs_suite.eval import leaderboard, result_file
 
 ROOT = Path(__file__).parents[2]
 
@@ -27,7 +27,7 @@ def add(folder: Path, policy: str, task: str, n: int = 5, **metadata: Any) -> Pa
         }
     )
     path = folder / policy / f"{task}.json"
-    results.write(result, path)
+    result_file.write(result, path)
     return path
 
 

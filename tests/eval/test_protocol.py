@@ -7,7 +7,7 @@ import pytest
 
 from hvs_suite.cli import main
 from hvs_suite.errors import OptionError, PolicyError, ScenarioError, UnknownTaskError
-from hvs_suite.eval import protocol, results
+from hvs_suite.eval import protocol, result_file
 from hvs_suite.tasks.variants import TASKS
 
 
@@ -30,7 +30,9 @@ def test_one_and_two_workers_write_the_same_rows(policy: str, tmp_path: Path) ->
     written = []
     for workers in (1, 2):
         path = tmp_path / f"{workers}.json"
-        results.write(protocol.evaluate(policy, "align-thesis", episodes=3, workers=workers), path)
+        result_file.write(
+            protocol.evaluate(policy, "align-thesis", episodes=3, workers=workers), path
+        )
         content = path.read_text()
         written.append((content[content.index('"episodes"') :], json.loads(content)["summary"]))
     assert written[0] == written[1]
@@ -76,7 +78,7 @@ def test_the_command_writes_the_file_and_exits_0_whatever_the_success(
     path = tmp_path / "made" / "zero.json"
     words = f"evaluate --policy zero --task align-easy --split test --episodes 1 --out {path}"
     assert main.run(words.split()) == 0
-    assert results.load(path).summary.n_success == 0
+    assert result_file.load(path).summary.n_success == 0
     assert "0 of 1 (0.0 %)" in capsys.readouterr().out
 
 

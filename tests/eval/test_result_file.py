@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hvs_suite.errors import OutputError, ResultError
-from hvs_suite.eval import results
+from hvs_suite.eval import result_file
 from hvs_suite.rollout import Episode
 
 
@@ -32,13 +32,15 @@ def episode(scenario: int, *, success: bool, error: float) -> Episode:
     )
 
 
-def make_result(n: int = 5, **summary: Any) -> results.Result:
-    rows = [results.EpisodeRow.of(episode(i, success=i < 3, error=float(i) / 3)) for i in range(n)]
+def make_result(n: int = 5, **summary: Any) -> result_file.Result:
+    rows = [
+        result_file.EpisodeRow.of(episode(i, success=i < 3, error=float(i) / 3)) for i in range(n)
+    ]
     names = {"task": "align-easy", "policy": "zero", "split": "test"} | summary
-    return results.Result(
+    return result_file.Result(
         schema_version=1,
-        summary=results.Summary.of(**names, rows=rows),
-        metadata=results.Metadata(
+        summary=result_file.Summary.of(**names, rows=rows),
+        metadata=result_file.Metadata(
             created="2026-01-01T00:00:00+00:00",
             suite_version="0.1.0",
             task_version=1,
@@ -50,7 +52,7 @@ def make_result(n: int = 5, **summary: Any) -> results.Result:
             cpu="a processor",
             platform="Linux-x86_64",
         ),
-        timings=results.Timings(workers=1, wall_s=1.0, steps_per_s=50.0, decision_ms=0.1),
+        timings=result_file.Timings(workers=1, wall_s=1.0, steps_per_s=50.0, decision_ms=0.1),
         episodes=rows,
     )
 
@@ -68,23 +70,23 @@ def test_the_summary_counts_what_the_rows_say() -> None:
 
 
 def test_steps_to_the_goal_are_null_without_a_success() -> None:
-    rows = [results.EpisodeRow.of(episode(0, success=False, error=1.0))]
-    assert results.Summary.of("t", "p", "test", rows).steps_to_goal_mean is None
+    rows = [result_file.EpisodeRow.of(episode(0, success=False, error=1.0))]
+    assert result_file.Summary.of("t", "p", "test", rows).steps_to_goal_mean is None
 
 
 def test_a_written_result_reads_back_the_same(tmp_path: Path) -> None:
     path = tmp_path / "zero" / "align-easy.json"
-    results.write(make_result(), path)
-    assert results.load(path) == make_result()
+    result_file.write(make_result(), path)
+    assert result_file.load(path) == make_result()
     assert [file.name for file in path.parent.iterdir()] == ["align-easy.json"]
 
 
 def test_each_row_stands_on_its_own_line_with_the_fixed_keys(tmp_path: Path) -> None:
     path = tmp_path / "result.json"
-    results.write(make_result(), path)
+    result_file.write(make_result(), path)
     content = json.loads(path.read_text())
     keys = "scenario success success_once collision truncated steps steps_to_goal n_clipped"
-    assert list(content["episodes"][0]) == [*keys.split(), *results.ERRORS]
+    assert list(content["episodes"][0]) == [*keys.split(), *result_file.ERRORS]
     lines = path.read_text().splitlines()
     assert json.dumps(content["episodes"][1]) + "," in [line.strip() for line in lines]
 
@@ -92,7 +94,7 @@ def test_each_row_stands_on_its_own_line_with_the_fixed_keys(tmp_path: Path) -> 
 def test_a_result_cannot_be_written_below_a_file(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="file"):
-        results.write(make_result(), tmp_path / "file" / "result.json")
+        result_file.write(make_result(), tmp_path / "file" / "result.json")
 
 
 BROKEN: dict[str, tuple[Any, str]] = {
@@ -142,13 +144,13 @@ BROKEN: dict[str, tuple[Any, str]] = {
 @pytest.mark.parametrize("how", BROKEN)
 def test_a_file_that_cannot_be_true_is_refused(how: str, tmp_path: Path) -> None:
     path = tmp_path / "result.json"
-    results.write(make_result(), path)
+    result_file.write(make_result(), path)
     content = json.loads(path.read_text())
     tamper, reason = BROKEN[how]
     tamper(content)
     path.write_text(json.dumps(content))
     with pytest.raises(ResultError) as caught:
-        results.load(path)
+        result_file.load(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert reason in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -159,9 +161,9 @@ def test_what_is_no_result_is_refused(content: str, tmp_path: Path) -> None:
     path = tmp_path / "result.json"
     path.write_text(content, encoding="latin-1")
     with pytest.raises(ResultError, match=r"result\.json"):
-        results.load(path)
+        result_file.load(path)
 
 
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ResultError, match="cannot be read"):
-        results.load(tmp_path / "none.json")
+        result_file.load(tmp_path / "none.json")
