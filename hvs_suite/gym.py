@@ -11,7 +11,7 @@ scene, and the renderer is made at the first reset, in whichever process that ha
 """
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, cast
 
 import dm_env
 import gymnasium
@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from hvs_suite.errors import OptionError
 from hvs_suite.registry import load
 from hvs_suite.tasks.variants import TASKS
 
@@ -28,7 +29,7 @@ RENDER_SIDE_PX = 480
 Observation = dict[str, npt.NDArray[Any]]
 
 
-class AlignEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
+class AlignEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
     """A named task behind Gymnasium's interface.
 
     Observations are a flat ``Dict``: ``eih`` and ``eth`` uint8 (H, W, C), ``joint_positions``
@@ -53,7 +54,7 @@ class AlignEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         ScenarioError: The split's name is empty.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
 
     def __init__(
         self,
@@ -75,11 +76,13 @@ class AlignEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         self.task = variant.name
         self.task_description = variant.instruction
         specification = self._environment.observation_spec()
-        self.observation_space = spaces.Dict(
-            {name: _space(spec) for name, spec in specification.items()}
-        )
+        self._spaces: dict[str, spaces.Space[Any]] = {
+            name: _space(spec) for name, spec in specification.items()
+        }
+        self.observation_space = spaces.Dict(self._spaces)
         action = self._environment.action_spec()
         self.action_space = spaces.Box(-1.0, 1.0, action.shape, np.float32)
+        self._max_episode_steps: int = variant.time_limit_steps
         self._playing = False
         self._frame: npt.NDArray[np.uint8] | None = None
 
@@ -138,7 +141,7 @@ class AlignEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         reward = 0.0 if time_step.reward is None else float(time_step.reward)
         return self._observation(time_step), reward, terminated, truncated, info
 
-    def render(self) -> npt.NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> npt.NDArray[np.uint8] | None:
         """The cell as RGB (480, 480, 3) uint8, drawn once a control step; None without a mode."""
         if self.render_mode is None:
             gymnasium.logger.warn("render() needs render_mode='rgb_array'; nothing was drawn")
@@ -156,7 +159,7 @@ class AlignEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         self._frame = None
         return {
             name: np.asarray(time_step.observation[name], dtype=space.dtype)
-            for name, space in self.observation_space.items()
+            for name, space in self._spaces.items()
         }
 
     def _info(self) -> dict[str, Any]:
@@ -172,6 +175,67 @@ def _space(spec: Any) -> spaces.Box:
     low = np.broadcast_to(spec.minimum, spec.shape).astype(dtype)
     high = np.broadcast_to(spec.maximum, spec.shape).astype(dtype)
     return spaces.Box(low, high, spec.shape, dtype)  # type: ignore[arg-type]
+
+
+class PixelsAgentPos(gymnasium.Wrapper[Any, Any, Observation, Any]):
+    """The same environment with the observations that LeRobot's environments have.
+
+    ``pixels`` holds the camera images by name, uint8 (H, W, 3); ``agent_pos`` the measured joint
+    positions (rad), then velocities (rad/s), float32 (14,).
+
+    Args:
+        env: An :class:`AlignEnv`.
+
+    Raises:
+        OptionError: The task's images are not uint8 RGB, which is all that LeRobot takes.
+    """
+
+    def __init__(self, env: AlignEnv) -> None:
+        super().__init__(env)
+        inner = cast(spaces.Dict, env.observation_space)
+        cameras = {name: space for name, space in inner.items() if len(space.shape or ()) == 3}
+        for name, space in cameras.items():
+            if space.dtype != np.uint8 or (space.shape or (0,))[-1] != 3:
+                raise OptionError(
+                    f"LeRobot takes uint8 RGB images, and {name} is {space.dtype} "
+                    f"{space.shape}: leave out depth, grey and normalised images."
+                )
+        self._cameras = tuple(cameras)
+        self._vectors = tuple(
+            name for name in ("joint_positions", "joint_velocities") if name in inner.spaces
+        )
+        view: dict[str, spaces.Space[Any]] = {"pixels": spaces.Dict(cameras)}
+        if self._vectors:
+            boxes = [cast(spaces.Box, inner[name]) for name in self._vectors]
+            view["agent_pos"] = spaces.Box(
+                np.concatenate([box.low for box in boxes]),
+                np.concatenate([box.high for box in boxes]),
+                dtype=np.float32,
+            )
+        self.observation_space = spaces.Dict(view)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """As :meth:`AlignEnv.reset`."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._view(observation), info
+
+    def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """As :meth:`AlignEnv.step`."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self._view(observation), float(reward), terminated, truncated, info
+
+    def _view(self, observation: Observation) -> dict[str, Any]:
+        view: dict[str, Any] = {"pixels": {name: observation[name] for name in self._cameras}}
+        if self._vectors:
+            view["agent_pos"] = np.concatenate([observation[name] for name in self._vectors])
+        return view
+
+
+def make_pixels_agent_pos(task: str, **options: Any) -> PixelsAgentPos:
+    """Makes the LeRobot view of a named task; importable by worker processes without LeRobot."""
+    return PixelsAgentPos(AlignEnv(task, **options))
 
 
 def register() -> None:
