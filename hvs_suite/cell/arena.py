@@ -46,8 +46,9 @@ class Cell(composer.Arena):
         root.statistic.center = [0, 0, 0.4]
         root.visual.map.znear = 0.005
         root.visual.map.zfar = 15.0
-        # Half the width that the light's shadow map covers (m); beyond it the surface turns grainy.
-        root.visual.map.shadowclip = 2.0
+        # Half the width of the light's shadow map (m). A smaller, sharper one speckles the surface
+        # with its own shadow wherever the light falls aslant.
+        root.visual.map.shadowclip = 6.0
         root.visual.headlight.ambient = [0.35, 0.35, 0.35]
         root.visual.headlight.diffuse = [0.15, 0.15, 0.15]
         root.visual.headlight.specular = [0.0, 0.0, 0.0]
