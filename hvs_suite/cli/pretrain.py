@@ -1,14 +1,27 @@
 """``hvs pretrain``: the ``hvs`` policy, trained on a dataset by behaviour cloning."""
 
+import contextlib
 import dataclasses
+import math
+import sys
+import time
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hvs_suite.cli.console import PLAIN_PROGRESS_PERIOD_S
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from hvs_suite.policies.pretrain import Progress
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Pretrain:
     """Train the hvs policy on demonstrations by behaviour cloning.
 
-    The task comes from the dataset. Trains for --minutes or --steps, whichever is given.
+    The task comes from the dataset. Trains for --minutes or --steps, or until the first of both.
+    Interrupted, it goes on from its last checkpoint when the same command is given again.
 
     Attributes:
         data: Root folder of the dataset, as hvs record makes it.
@@ -23,4 +36,75 @@ class Pretrain:
     steps: int | None = None
 
     def run(self) -> None:
-        """Train, and say where the checkpoint is."""
+        """Train, showing how it goes, and say where the checkpoint is."""
+        from hvs_suite.policies.pretrain import pretrain
+
+        with _watch() as note:
+            outcome = pretrain(
+                self.data, self.out, minutes=self.minutes, steps=self.steps, on_progress=note
+            )
+        held_out = (
+            "" if math.isnan(outcome.held_out_loss) else f", held out {outcome.held_out_loss:.4f}"
+        )
+        print(
+            f"{outcome.step} steps in {outcome.train_s:.0f} s ({outcome.frames_per_s:.0f} frames/s, "
+            f"{outcome.n_parameters:,} parameters); loss {outcome.loss:.4f}{held_out}"
+        )
+        print(f"wrote {self.out}")
+
+
+@contextlib.contextmanager
+def _watch() -> "Iterator[Callable[[Progress], None]]":
+    """Show training as a bar in a terminal, and as a line every ten seconds elsewhere."""
+    if not sys.stderr.isatty():
+        yield _lines()
+        return
+    from rich import progress as rich_progress
+    from rich.console import Console
+
+    bar = rich_progress.Progress(
+        rich_progress.TextColumn("{task.description}"),
+        rich_progress.BarColumn(),
+        rich_progress.TaskProgressColumn(),
+        rich_progress.TextColumn("{task.fields[note]}"),
+        console=Console(stderr=True),
+    )
+    with bar:
+        tasks: dict[str, rich_progress.TaskID] = {}
+
+        def note(state: "Progress") -> None:
+            if state.stage not in tasks:
+                tasks[state.stage] = bar.add_task(state.stage, total=1.0, note="")
+            bar.update(tasks[state.stage], completed=state.share, note=_words(state))
+
+        yield note
+
+
+def _lines() -> "Callable[[Progress], None]":
+    """A function that prints how training goes, now and then."""
+    last = -math.inf
+
+    def note(state: "Progress") -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last >= PLAIN_PROGRESS_PERIOD_S:
+            last = now
+            print(
+                f"{state.stage}: {100.0 * state.share:.0f} %, {_words(state)}",
+                file=sys.stderr,
+                flush=True,
+            )
+
+    return note
+
+
+def _words(state: "Progress") -> str:
+    """Rate, time left and losses, in words."""
+    parts = [f"{state.frames_per_s:.0f} frames/s", f"{state.seconds_left:.0f} s left"]
+    if state.step:
+        parts.insert(0, f"step {state.step}")
+    if not math.isnan(state.loss):
+        parts.append(f"loss {state.loss:.4f}")
+    if not math.isnan(state.held_out_loss):
+        parts.append(f"held out {state.held_out_loss:.4f}")
+    return ", ".join(parts)

@@ -15,11 +15,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from hvs_suite.cell.environment import Environment
+    from hvs_suite.tasks.certificate import Certificate, Check
     from hvs_suite.tasks.variants import AlignVariant
 
 CELL_PX = 720
 FIGURE_WIDTH_IN = 12.0
-PANEL_IN = 3.8
+PANEL_IN = 3.72
 ROW_IN = 0.235
 DPI = 110
 INK, FAINT, RULE, PASS, FAIL = "#1e2024", "#6e7278", "#d8d9d6", "#16803c", "#be1e1e"
@@ -52,33 +53,16 @@ class Show:
             raise OutputError(f"{self.out} must end in .png")
         check_writable(self.out)
         with hvs_suite.load(self.task, split="test") as env:
-            rows = certificate_rows(load_certificate(self.task))
+            certificate = load_certificate(self.task)
             start, goal = look(env, self.scenario)
-            figure = draw(env.variant, self.scenario, start, goal, rows)
+            figure = draw(env.variant, self.scenario, start, goal, certificate)
         with replacing(self.out) as temporary:
             figure.savefig(temporary, dpi=DPI, facecolor="white")
         console.print_table(
-            (f"{self.task}: certificate", "found", "needed", ""),
-            [(row.what, row.found, row.needed, "ok" if row.holds else "FAILS") for row in rows],
+            (title(certificate), "found", "needed", ""),
+            [(c.what, c.found, c.needed, verdict(c)) for c in certificate.checks],
         )
         print(f"wrote {self.out}")
-
-
-@dataclasses.dataclass(frozen=True)
-class CertificateRow:
-    """One line of a certificate.
-
-    Attributes:
-        what: What was checked.
-        found: What was found over all test scenarios.
-        needed: The bound it has to keep; empty where the figure is for information.
-        holds: Whether it keeps it.
-    """
-
-    what: str
-    found: str
-    needed: str
-    holds: bool
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -125,7 +109,7 @@ def look(env: "Environment", scenario: int) -> tuple[Moment, Moment]:
 
 
 def draw(
-    variant: "AlignVariant", scenario: int, start: Moment, goal: Moment, rows: list[CertificateRow]
+    variant: "AlignVariant", scenario: int, start: Moment, goal: Moment, certificate: "Certificate"
 ) -> "Figure":
     """Lay out the picture: start above goal, cell and cameras side by side, certificate below.
 
@@ -134,15 +118,15 @@ def draw(
         scenario: Index that was drawn.
         start: The cell after the reset.
         goal: The cell at the goal.
-        rows: The certificate.
+        certificate: The task's certificate.
 
     Returns:
         The figure.
     """
     from matplotlib.figure import Figure
 
-    table_in = ROW_IN * (len(rows) + 2)
-    head_in, gap_in, edge_in = 0.95, 0.42, 0.25
+    table_in = ROW_IN * (len(certificate.checks) + 2)
+    head_in, gap_in, edge_in = 1.2, 0.45, 0.25
     height = head_in + 2 * (PANEL_IN + gap_in) + table_in + edge_in
     figure = Figure(figsize=(FIGURE_WIDTH_IN, height))
 
@@ -153,12 +137,19 @@ def draw(
     put_text(
         edge_in,
         0.62,
-        f"{tolerance(variant)}"
+        f"to reach: {tolerance(variant)}"
         + (f", held {variant.hold_steps} steps" if variant.hold_steps > 1 else "")
-        + f"; {variant.time_limit_steps} steps of {variant.control_period_s:g} s"
-        + f"; {variant.target_diameter_m * 1000:.0f} mm {variant.marker}"
-        + f"; varied: {disturbances(variant).replace('-', 'nothing else', 1)}"
-        + f"; test scenario {scenario}",
+        + f", within {variant.time_limit_steps} steps of {variant.control_period_s:g} s",
+        size=10,
+        color=FAINT,
+    )
+    varied = disturbances(variant)
+    put_text(
+        edge_in,
+        0.84,
+        f"start {variant.start}, goal {variant.goal}, "
+        f"{variant.target_diameter_m * 1000:.0f} mm {variant.marker}; "
+        f"disturbed: {'nothing' if varied == '-' else varied}; shown: test scenario {scenario}",
         size=10,
         color=FAINT,
     )
@@ -183,25 +174,28 @@ def draw(
             )
             axes.imshow(image, interpolation=interpolation)
             axes.set_axis_off()
-    _draw_table(put_text, height - edge_in - table_in + 0.05, edge_in, rows)
+    _draw_table(put_text, height - edge_in - table_in + 0.05, edge_in, certificate)
     return figure
 
 
-def _draw_table(put_text: Any, top: float, left: float, rows: list[CertificateRow]) -> None:
-    """Write the certificate's rows, one line each."""
-    columns = (left, left + 5.2, left + 8.4, left + 11.1)
-    headings = ("certificate over all test scenarios", "found", "needed", "")
-    for x, heading in zip(columns, headings, strict=True):
+def title(certificate: "Certificate") -> str:
+    """What a certificate is about, as a heading."""
+    return f"certificate of {certificate.task}, {certificate.scenarios:,} test scenarios"
+
+
+def verdict(check: "Check") -> str:
+    """Whether a check holds, in a word."""
+    return "ok" if check.holds else "FAILS"
+
+
+def _draw_table(put_text: Any, top: float, left: float, certificate: "Certificate") -> None:
+    """Write the certificate's checks, one line each."""
+    columns = (left, left + 6.9, left + 8.9, left + 11.0)
+    for x, heading in zip(columns, (title(certificate), "found", "needed", ""), strict=True):
         put_text(x, top, heading, size=9.5, weight="bold", color=INK)
-    for index, row in enumerate(rows):
+    for index, check in enumerate(certificate.checks):
         y = top + ROW_IN * (index + 1.15)
-        for x, cell in zip(columns, (row.what, row.found, row.needed), strict=False):
+        for x, cell in zip(columns, (check.what, check.found, check.needed), strict=False):
             put_text(x, y, cell, size=9.5, color=INK)
-        put_text(
-            columns[3],
-            y,
-            "ok" if row.holds else "FAILS",
-            size=9.5,
-            weight="bold",
-            color=PASS if row.holds else FAIL,
-        )
+        colour = PASS if check.holds else FAIL
+        put_text(columns[3], y, verdict(check), size=9.5, weight="bold", color=colour)
