@@ -16,17 +16,20 @@ if TYPE_CHECKING:
     from hvs_suite.policies.pretrain import Progress
 
 
+DEFAULT_MINUTES = 10.0
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Pretrain:
     """Train the hvs policy on demonstrations by behaviour cloning.
 
-    The task comes from the dataset. Trains for --minutes or --steps, or until the first of both.
-    Interrupted, it goes on from its last checkpoint when the same command is given again.
+    The task comes from the dataset. Trains for --minutes or --steps, whichever ends first, or for
+    ten minutes if neither is given. Interrupted, it goes on from its last checkpoint when the same command is given again.
 
     Attributes:
         data: Root folder of the dataset, as hvs record makes it.
         out: Folder for the checkpoint; loads with from_pretrained.
-        minutes: Stop after this long (min).
+        minutes: Stop after this much training, decoding not counted (min).
         steps: Stop after this many optimiser steps.
     """
 
@@ -39,16 +42,19 @@ class Pretrain:
         """Train, showing how it goes, and say where the checkpoint is."""
         from hvs_suite.policies.pretrain import pretrain
 
+        minutes = self.minutes
+        if minutes is None and self.steps is None:
+            minutes = DEFAULT_MINUTES
         with _watch() as note:
             outcome = pretrain(
-                self.data, self.out, minutes=self.minutes, steps=self.steps, on_progress=note
+                self.data, self.out, minutes=minutes, steps=self.steps, on_progress=note
             )
         held_out = (
             "" if math.isnan(outcome.held_out_loss) else f", held out {outcome.held_out_loss:.4f}"
         )
         print(
-            f"{outcome.step} steps in {outcome.train_s:.0f} s ({outcome.frames_per_s:.0f} frames/s, "
-            f"{outcome.n_parameters:,} parameters); loss {outcome.loss:.4f}{held_out}"
+            f"{outcome.step} steps in {outcome.train_s:.0f} s, {outcome.frames_per_s:.0f} frames/s, "
+            f"{outcome.n_parameters:,} parameters; loss {outcome.loss:.4f}{held_out}"
         )
         print(f"wrote {self.out}")
 
