@@ -131,7 +131,8 @@ def _overview() -> str:
         "",
     ]
     for name, where in COMMANDS.items():
-        lines.append(f"  {name:<13}{inspect.getdoc(_load(where)).partition('\n')[0]}")
+        summary = (inspect.getdoc(_load(where)) or "").partition("\n")[0]
+        lines.append(f"  {name:<13}{summary}")
     return "\n".join([*lines, "", "'hvs COMMAND --help' explains the options of a command."])
 
 

@@ -24,7 +24,8 @@ class Pretrain:
     """Train the hvs policy on demonstrations by behaviour cloning.
 
     The task comes from the dataset. Trains for --minutes or --steps, whichever ends first, or for
-    ten minutes if neither is given. Interrupted, it goes on from its last checkpoint when the same command is given again.
+    ten minutes if neither is given. Interrupted, it goes on from its last checkpoint when the same
+    command is given again.
 
     Attributes:
         data: Root folder of the dataset, as hvs record makes it.
@@ -53,8 +54,8 @@ class Pretrain:
             "" if math.isnan(outcome.held_out_loss) else f", held out {outcome.held_out_loss:.4f}"
         )
         print(
-            f"{outcome.step} steps in {outcome.train_s:.0f} s, {outcome.frames_per_s:.0f} frames/s, "
-            f"{outcome.n_parameters:,} parameters; loss {outcome.loss:.4f}{held_out}"
+            f"{outcome.step} steps in {outcome.train_s:.0f} s, "
+            f"{outcome.frames_per_s:.0f} frames/s, {outcome.n_parameters:,} parameters; loss {outcome.loss:.4f}{held_out}"
         )
         print(f"wrote {self.out}")
 
