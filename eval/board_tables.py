@@ -175,9 +175,11 @@ def interval(result: Result) -> str:
 
 
 def figure(value: float | None) -> str:
-    """Returns a number with three significant digits; a dash for None."""
+    """Returns a number with two or three significant digits; a dash for None."""
     if value is None:
         return "\N{EN DASH}"
+    if 0 < value < 0.005:
+        return "< 0.01"
     if value >= 100:
         return f"{value:.0f}"
     return f"{value:.2f}" if value < 10 else f"{value:.1f}"

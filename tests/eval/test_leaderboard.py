@@ -12,7 +12,7 @@ import pytest
 from test_result_file import make_result
 
 from hvs_suite.errors import OutputError, ResultError
-from hvs_suite.eval import leaderboard, result_file
+from hvs_suite.eval import board_tables, leaderboard, result_file
 
 ROOT = Path(__file__).parents[2]
 
@@ -97,6 +97,14 @@ def test_a_hostile_name_stays_text(tmp_path: Path) -> None:
     assert "<img" not in page.read_text()
     assert "<img" not in board.read_text()
     assert "(1)&#62;&#124; |" in board.read_text()
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(None, "–"), (0.0, "0.00"), (4e-5, "< 0.01"), (0.25, "0.25"), (12.34, "12.3"), (390.4, "390")],
+)
+def test_figures_keep_the_digits_that_matter(value: float | None, text: str) -> None:
+    assert board_tables.figure(value) == text
 
 
 def test_no_results_say_how_to_make_one(tmp_path: Path) -> None:
