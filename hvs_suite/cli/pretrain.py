@@ -55,8 +55,9 @@ class Pretrain:
         )
         print(
             f"{outcome.step} steps in {outcome.train_s:.0f} s, "
-            f"{outcome.frames_per_s:.0f} frames/s, {outcome.n_parameters:,} parameters; loss {outcome.loss:.4f}{held_out}"
+            f"{outcome.frames_per_s:.0f} frames/s, {outcome.n_parameters:,} parameters"
         )
+        print(f"loss {outcome.loss:.4f}{held_out}")
         print(f"wrote {self.out}")
 
 

@@ -1,5 +1,6 @@
 """The built wheel, the lock and the licence: what a user gets who never sees this checkout."""
 
+import ast
 import configparser
 import re
 import shutil
@@ -38,6 +39,22 @@ def wheel_folder(tmp_path_factory):
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(unpacked)
     return unpacked
+
+
+def declared_requirements():
+    """What setup.cfg asks for: the base, to learn and to develop."""
+    from packaging.requirements import Requirement
+
+    config = configparser.ConfigParser()
+    config.read(ROOT / "setup.cfg", encoding="utf-8")
+    texts = [config["options"]["install_requires"]]
+    texts += [config["options.extras_require"][extra] for extra in ("learn", "dev")]
+    return [
+        Requirement(line)
+        for text in texts
+        for line in text.splitlines()
+        if line.strip() and not line.startswith("#")
+    ]
 
 
 def tracked_files(*patterns):
@@ -113,23 +130,33 @@ def test_lock_names_no_host_no_hash_and_no_path():
 
 
 def test_lock_holds_every_declared_requirement_within_its_bounds():
-    from packaging.requirements import Requirement
-
     pins = {}
     for line in (ROOT / "requirements.lock").read_text(encoding="utf-8").splitlines():
         name, version = line.split(" ;")[0].split("==")
         pins[name] = version
-    config = configparser.ConfigParser()
-    config.read(ROOT / "setup.cfg", encoding="utf-8")
-    texts = [config["options"]["install_requires"]]
-    texts += [config["options.extras_require"][extra] for extra in ("learn", "dev")]
-    declared = [
-        Requirement(line)
-        for text in texts
-        for line in text.splitlines()
-        if line.strip() and not line.startswith("#")
-    ]
+    declared = declared_requirements()
     assert [r.name for r in declared if not r.specifier.contains(pins.get(r.name, ""))] == []
+
+
+def test_every_package_that_is_imported_is_declared():
+    from importlib.metadata import packages_distributions
+
+    imported = set()
+    sources = [path for top in ("hvs_suite", *ROOMS) for path in (ROOT / top).rglob("*.py")]
+    for path in sources:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                imported |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+                imported.add(node.module.partition(".")[0])
+    foreign = imported - set(sys.stdlib_module_names) - {"hvs_suite"}
+    declared = {requirement.name for requirement in declared_requirements()}
+    packages = packages_distributions()
+    assert [
+        module
+        for module in sorted(foreign)
+        if not declared & {name.lower() for name in packages[module]}
+    ] == []
 
 
 def test_installed_packages_are_those_of_the_lock():
