@@ -62,7 +62,7 @@ ARMATURE_KG_M2 = 0.1
 # after the set point arrives and pass the goal by less than 0.1 mm, torque limits included.
 STIFFNESS_NM_RAD: FloatArray = np.array([21e3, 41e3, 9.9e3, 10.3e3, 520.0, 520.0, 475.0])
 """Position gain of each joint; gravity is compensated, so it carries no standing load."""
-DAMPING_NM_S_RAD: FloatArray = np.array([670.0, 1280.0, 298.0, 286.0, 17.2, 17.2, 15.6])
+DAMPING_NM_S_RAD: FloatArray = np.array([670.0, 1300.0, 298.0, 286.0, 17.2, 17.2, 15.6])
 """Velocity gain of each joint, on the joint's own speed: a moving set point leads by kv / kp."""
 
 ROBOT_BIT = 1

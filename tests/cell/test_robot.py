@@ -117,12 +117,13 @@ def test_inertias_are_those_of_the_shells_scaled_to_the_published_masses(
         )
 
 
+@pytest.mark.parametrize("n_goals", [20, pytest.param(300, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("motion", ["full_speed", "accelerations", "small_step"])
 def test_the_tip_stands_two_control_steps_after_the_set_point_arrives(
-    model: mujoco.MjModel, motion: str
+    model: mujoco.MjModel, motion: str, n_goals: int
 ) -> None:
     rng = np.random.default_rng(1)
-    for position in ring_points(20, seed=3):
+    for position in ring_points(n_goals, seed=3):
         if motion == "full_speed":
             start, goal = np.zeros(7), fastest(position, acceleration_limits=False)
             set_points = goal[None]
