@@ -379,8 +379,8 @@ class Align(ServoTask):
             return self.cameras[camera].id
         view = mujoco.MjvCamera()
         view.type = mujoco.mjtCamera.mjCAMERA_FREE.value
-        view.lookat[:] = [0.05, 0.0, 0.42]
-        view.distance, view.azimuth, view.elevation = 2.6, 145.0, -22.0
+        view.lookat[:] = [0.0, 0.0, 0.48]
+        view.distance, view.azimuth, view.elevation = 2.15, 145.0, -22.0
         return view
 
     def _measure(self, physics: mjcf.Physics) -> None:

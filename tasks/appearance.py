@@ -49,7 +49,6 @@ class Appearance:
                 "light_dir",
                 "light_diffuse",
                 "mat_rgba",
-                "geom_rgba",
             )
         }
         self._ambient = np.array(model.vis.headlight.ambient)
@@ -76,11 +75,8 @@ class Appearance:
         self._paint(model, scenario.texture_seed)
 
     def _tint_robot(self, model: Any, tint: FloatArray) -> None:
-        model.geom_rgba[self._shells, :3] = np.clip(
-            model.geom_rgba[self._shells, :3] * tint, 0.0, 1.0
-        )
+        # A geom's own colour hides its material's, so only the materials are tinted.
         materials = np.unique(model.geom_matid[self._shells])
-        materials = materials[materials >= 0]
         model.mat_rgba[materials, :3] = np.clip(model.mat_rgba[materials, :3] * tint, 0.0, 1.0)
 
     def _paint(self, model: Any, seed: int | None) -> None:

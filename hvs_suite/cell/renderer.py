@@ -42,7 +42,7 @@ class Renderer:
         model.vis.global_.offwidth = max_side
         model.vis.global_.offheight = max_side
         model.vis.quality.offsamples = multisampling
-        model.vis.quality.shadowsize = 2048 if studio else 0
+        model.vis.quality.shadowsize = 4096 if studio else 0
         try:
             self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         except mujoco.FatalError as error:
