@@ -4,7 +4,7 @@ PY := .venv/bin/python
 # Two test workers on two cores: more threads inside each would only fight over them.
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 --dist loadfile
 
-.PHONY: help demo test test-full lint lock clean
+.PHONY: help demo test test-full lint lock certificates clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*##/\t/' | expand -t 12
@@ -27,6 +27,9 @@ lock:  ## resolve requirements.lock anew
 	uv pip compile setup.cfg --extra learn --extra dev --override scripts/lock.overrides \
 	  --universal --python-version 3.12 --upgrade --quiet \
 	  --no-annotate --no-header --no-emit-index-url --no-emit-find-links -o requirements.lock
+
+certificates: .venv/.up-to-date  ## certify the named tasks and write the version lock
+	@$(PY) -m hvs_suite.certify
 
 clean:  ## remove .venv, runs and caches
 	rm -rf .venv runs build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
