@@ -247,7 +247,7 @@ class _Run:
                 torch.nn.utils.clip_grad_norm_(policy.parameters(), GRADIENT_NORM)
                 optimizer.step()
 
-                recent = [*recent[1 - LOG_EVERY_STEPS :], float(loss)]
+                recent = [*recent[1 - LOG_EVERY_STEPS :], loss.item()]
                 self._loss = sum(recent) / len(recent)
                 self._frames += batch_size
                 now = time.perf_counter()
@@ -367,7 +367,7 @@ def _held_out(policy: "HvsPolicy", demonstrations: Demonstrations) -> dict[str, 
         for first in range(0, len(indices), HELD_OUT_BATCH):
             part = indices[first : first + HELD_OUT_BATCH]
             loss, parts = policy(demonstrations.batch(part))
-            for name, value in {"loss": float(loss), **parts}.items():
+            for name, value in {"loss": loss.item(), **parts}.items():
                 sums[name] = sums.get(name, 0.0) + value * len(part)
     policy.train()
     return {name: value / len(indices) for name, value in sums.items()}

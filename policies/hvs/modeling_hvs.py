@@ -99,7 +99,7 @@ class HvsPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 "training without keypoint supervision: the batch has no `privileged.target_*`"
             )
             self._warned = True
-        return loss, {name: float(part) for name, part in parts.items()}
+        return loss, {name: part.item() for name, part in parts.items()}
 
     @torch.no_grad()
     def predict_action_chunk(

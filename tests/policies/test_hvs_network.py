@@ -1,0 +1,160 @@
+"""The network: what it reads, what it must not read, and the geometry it stands on."""
+
+from pathlib import Path
+
+import miniature
+import numpy as np
+import pytest
+import torch
+
+from hvs_suite.cell.kinematics import kinematics
+from hvs_suite.cell.robot import JOINT_RANGE_RAD
+from hvs_suite.policies.hvs import geometry
+from hvs_suite.policies.hvs.network import (
+    FEATURE_SIZE,
+    HvsNetwork,
+    Shape,
+    action_loss,
+    sighting_loss,
+    strides,
+)
+
+CAMERAS = {"eih": (3, 28), "eth": (3, 28)}
+
+
+def network(cameras=CAMERAS, state_dim=14, seed=0):
+    torch.manual_seed(seed)
+    return HvsNetwork(Shape(cameras, state_dim, channels=8, hidden=32))
+
+
+def inputs(cameras=CAMERAS, state_dim=14, n=5):
+    generator = torch.Generator().manual_seed(1)
+    images = {
+        name: torch.rand(n, c, side, side, generator=generator)
+        for name, (c, side) in cameras.items()
+    }
+    state = torch.rand(n, state_dim, generator=generator) - 0.5 if state_dim else None
+    return images, state
+
+
+def test_kinematics_agree_with_pinocchio():
+    q = np.random.default_rng(0).uniform(-2.0, 2.0, (20, 7))
+    motion = geometry.flange_motion(torch.from_numpy(q))
+    for i, configuration in enumerate(q):
+        rotation, position = kinematics().flange_pose(configuration)
+        np.testing.assert_allclose(motion.rotation[i], rotation, atol=1e-9)
+        np.testing.assert_allclose(motion.position[i], position, atol=1e-9)
+        np.testing.assert_allclose(
+            motion.jacobian[i], kinematics().jacobian(configuration), atol=1e-9
+        )
+
+
+def test_joint_step_brings_the_flange_to_a_near_goal_facing_down():
+    poses = kinematics().goal_configurations(np.array([0.5, 0.2, 0.05]), np.array([0.0, 0.0, 1.0]))
+    q = torch.from_numpy(poses[:3] + 0.01)
+    goal = torch.tensor([0.5, 0.2, 0.05], dtype=torch.float64)
+    for _ in range(30):
+        motion = geometry.flange_motion(q)
+        q = q + geometry.joint_step(motion, goal - motion.position)
+    motion = geometry.flange_motion(q)
+    np.testing.assert_allclose(motion.position, goal.expand(3, 3), atol=1e-4)
+    np.testing.assert_allclose(motion.rotation[:, 2, 2], -np.ones(3), atol=1e-6)
+
+
+def test_calibration_finds_the_cameras_that_made_the_data():
+    rng = np.random.default_rng(0)
+    n = 200
+    target = np.column_stack([rng.uniform(-0.6, 0.6, (n, 2)), np.zeros(n)])
+    q = rng.uniform(-1.0, 1.0, (n, 7))
+    motion = geometry.flange_motion(torch.from_numpy(q))
+    rays = np.array([[0.0, -0.7, 0.01], [0.7, 0.0, -0.02], [0.0, 0.0, 1.0]])
+    offset = np.einsum("nji,nj->ni", motion.rotation.numpy(), target - motion.position.numpy())
+    uv_eih = (offset @ np.linalg.inv(rays).T)[:, :2]
+    uv_eih /= (offset @ np.linalg.inv(rays).T)[:, 2:]
+    homography = np.array([[0.0, 0.9, 0.1], [-1.0, 0.1, 0.0], [0.05, 0.1, 1.0]])
+    mapped = np.column_stack([target[:, :2], np.ones(n)]) @ np.linalg.inv(homography).T
+    seen = np.column_stack([np.full(n, 0.1), np.ones(n)])
+    found = geometry.calibrate(
+        q=q,
+        goal_position=target + np.array([0.0, 0.0, 0.05]),
+        goal_normal=np.tile([0.0, 0.0, 1.0], (n, 1)),
+        standoff_m=0.05,
+        target_eih=np.column_stack([uv_eih, seen]),
+        target_eth=np.column_stack([mapped[:, :2] / mapped[:, 2:], seen]),
+    )
+    np.testing.assert_allclose(found.rays, rays, atol=1e-6)
+    np.testing.assert_allclose(found.homography, homography, atol=1e-6)
+    assert found.plane_height_m == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize("state_dim", [0, 7, 14])
+@pytest.mark.parametrize("names", [("eih",), ("eth",), ("eih", "eth")])
+def test_every_subset_of_inputs_trains_and_acts(names, state_dim):
+    cameras = {name: CAMERAS[name] for name in names}
+    net = network(cameras, state_dim)
+    images, state = inputs(cameras, state_dim)
+    out, sightings, target = net(images, state)
+    assert out.shape == (5, 7)
+    assert (target is None) == (state is None)
+    truth = torch.tensor([[0.1, 0.2, 0.3, 1.0]]).expand(5, 4)
+    loss = action_loss(out, torch.ones(5, 7))
+    for sighting in sightings.values():
+        loss = loss + sighting_loss(sighting, truth)
+    loss.backward()
+    assert all(torch.isfinite(p.grad).all() for p in net.parameters() if p.grad is not None)
+    action = net.to_action(out, state)
+    assert action.shape == (5, 7)
+    assert (action.abs() <= 1.0).all()
+
+
+@pytest.mark.parametrize(("channels", "side"), [(1, 28), (3, 84), (3, 112), (1, 224), (3, 336)])
+def test_every_resolution_and_channel_count_has_about_28_cells(channels, side):
+    assert abs(side / np.prod(strides(side)) - FEATURE_SIZE) <= 2
+    cameras = {"eth": (channels, side)}
+    images, state = inputs(cameras, n=1)
+    assert network(cameras)(images, state)[0].shape == (1, 7)
+
+
+def test_the_label_is_what_the_action_decodes_to():
+    net = network()
+    _, state = inputs()
+    assert state is not None
+    reachable = state[:, :7] + 0.05 * torch.randn(5, 7, generator=torch.Generator().manual_seed(0))
+    action = reachable / torch.tensor(JOINT_RANGE_RAD, dtype=torch.float32)
+    decoded = net.to_action(net.encode_label(action, state), state)
+    torch.testing.assert_close(decoded, action, atol=1e-6, rtol=0.0)
+
+
+def test_a_few_images_are_learned_by_heart():
+    columns = miniature.scene(16)
+    net = network()
+    images = {
+        name: torch.from_numpy(columns[f"observation.images.{name}"]).permute(0, 3, 1, 2) / 255.0
+        for name in CAMERAS
+    }
+    state = torch.from_numpy(columns["observation.state"])
+    label = net.encode_label(torch.from_numpy(columns["action"]), state)
+    truth = {name: torch.from_numpy(columns[f"privileged.target_{name}"]) for name in CAMERAS}
+    optimizer = torch.optim.AdamW(net.parameters(), lr=3e-3)
+    losses = []
+    for _ in range(250):
+        out, sightings, _ = net(images, state)
+        loss = action_loss(out, label)
+        for name, sighting in sightings.items():
+            loss = loss + sighting_loss(sighting, truth[name])
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.15 * losses[0]
+
+
+def test_the_network_needs_no_lerobot(tmp_path: Path):
+    import subprocess
+    import sys
+
+    code = (
+        "import sys; import hvs_suite.policies.checkpoint, hvs_suite.policies.catalogue;"
+        "sys.exit(any(m.split('.')[0] in ('lerobot', 'datasets') for m in sys.modules))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], cwd=tmp_path).returncode == 0

@@ -1,0 +1,151 @@
+"""Behaviour cloning: it learns, resumes to the same end, and refuses what it should."""
+
+import json
+import math
+import shutil
+from pathlib import Path
+
+import miniature
+import numpy as np
+import pytest
+from safetensors.torch import load_file
+
+from hvs_suite.errors import DatasetError, OptionError, OutputError
+from hvs_suite.policies.demonstrations import Demonstrations, read_manifest
+from hvs_suite.policies.pretrain import pretrain
+
+
+def weights(folder: Path):
+    return load_file(folder / "model.safetensors")
+
+
+class Killed(BaseException):
+    """What a kill looks like to the loop."""
+
+
+def kill_after(steps: int):
+    def on_progress(progress):
+        if progress.step == steps:
+            raise Killed
+
+    return on_progress
+
+
+def test_training_lowers_the_loss_and_reports_it(dataset, tmp_path):
+    reports = []
+    outcome = pretrain(
+        dataset, tmp_path / "out", steps=40, batch_size=16, on_progress=reports.append
+    )
+    training = [r for r in reports if r.stage == "training"]
+    assert [r.step for r in training] == list(range(1, 41))
+    assert training[-1].loss < 0.7 * training[0].loss
+    assert training[-1].share == 1.0
+    assert sum(r.stage == "decoding" for r in reports) >= 1
+    assert outcome.step == 40
+    assert math.isfinite(outcome.held_out_loss)
+    assert json.loads((tmp_path / "out/training/outcome.json").read_text())["step"] == 40
+    assert list((tmp_path / "out/training/tensorboard").iterdir())
+
+
+def test_a_killed_run_ends_like_one_that_was_left_alone(dataset, tmp_path):
+    options = {"steps": 6, "batch_size": 8, "seed": 3, "checkpoint_period_s": 0.0}
+    pretrain(dataset, tmp_path / "whole", **options)
+    with pytest.raises(Killed):
+        pretrain(dataset, tmp_path / "cut", on_progress=kill_after(3), **options)
+    steps = []
+    pretrain(dataset, tmp_path / "cut", on_progress=lambda p: steps.append(p.step), **options)
+    assert steps == [4, 5, 6]
+    whole, cut = weights(tmp_path / "whole"), weights(tmp_path / "cut")
+    assert whole.keys() == cut.keys()
+    for name, value in whole.items():
+        np.testing.assert_array_equal(value, cut[name], err_msg=name)
+
+
+def test_a_run_killed_before_its_first_checkpoint_starts_again(dataset, tmp_path):
+    def on_decoding(progress):
+        raise Killed
+
+    with pytest.raises(Killed):
+        pretrain(dataset, tmp_path / "out", steps=2, batch_size=4, on_progress=on_decoding)
+    assert pretrain(dataset, tmp_path / "out", steps=2, batch_size=4).step == 2
+
+
+def test_the_same_seed_gives_the_same_weights_and_another_seed_others(dataset, tmp_path):
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        pretrain(dataset, tmp_path / name, steps=2, batch_size=4, seed=seed)
+    a, b, c = (weights(tmp_path / name) for name in "abc")
+    assert all((a[k] == b[k]).all() for k in a)
+    assert any((a[k] != c[k]).any() for k in a)
+
+
+def test_frames_come_back_from_the_cache_as_they_were_recorded(dataset, tmp_path):
+    columns = miniature.scene(40)
+    for _ in range(2):  # decoded, then opened again
+        decoded = []
+        demonstrations = Demonstrations(
+            read_manifest(dataset), tmp_path / "cache", 0, decoded.append
+        )
+        batch = demonstrations.batch(np.array([7, 31]))
+        for camera in ("eih", "eth"):
+            key = f"observation.images.{camera}"
+            pixels = (batch[key] * 255).round().permute(0, 2, 3, 1)
+            np.testing.assert_array_equal(pixels, columns[key][[7, 31]])
+        np.testing.assert_array_equal(batch["action"], columns["action"][[7, 31]])
+    assert decoded == []
+
+
+def test_held_out_frames_are_whole_episodes_that_training_never_sees(dataset, tmp_path):
+    demonstrations = Demonstrations(read_manifest(dataset), tmp_path, seed=0)
+    held_out = set(demonstrations.held_out // 4)
+    assert held_out
+    assert held_out.isdisjoint(set(demonstrations.training // 4))
+    assert len(demonstrations.held_out) + len(demonstrations.training) == 40
+
+
+def test_data_recorded_on_the_test_split_is_refused(tmp_path):
+    root = tmp_path / "data"
+    miniature.write_dataset(root, miniature.scene(4), miniature.episodes(4), split="test")
+    with pytest.raises(DatasetError, match="test split"):
+        pretrain(root, tmp_path / "out", steps=1)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_is_no_dataset_is_refused(tmp_path):
+    with pytest.raises(DatasetError, match="not a LeRobot dataset"):
+        pretrain(tmp_path / "nothing", tmp_path / "out", steps=1)
+
+
+def test_a_dataset_with_frames_missing_is_refused(dataset, tmp_path):
+    root = tmp_path / "data"
+    shutil.copytree(dataset, root)
+    (root / "data/chunk-000/file-001.parquet").unlink()
+    with pytest.raises(DatasetError, match="declares 40 frames but holds 20"):
+        pretrain(root, tmp_path / "out", steps=1)
+
+
+def test_a_folder_in_use_is_refused(dataset, tmp_path):
+    (tmp_path / "letter.txt").write_text("dear reader")
+    with pytest.raises(OutputError, match="not empty"):
+        pretrain(dataset, tmp_path, steps=1)
+
+
+def test_a_run_with_other_settings_is_not_mixed_into(dataset, tmp_path):
+    pretrain(dataset, tmp_path / "out", steps=1, batch_size=4, seed=0)
+    with pytest.raises(OutputError, match="another seed"):
+        pretrain(dataset, tmp_path / "out", steps=1, batch_size=4, seed=1)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"steps": 0},
+        {"minutes": -1.0},
+        {"minutes": math.nan},
+        {"steps": 1, "batch_size": 0},
+        {"steps": 1, "learning_rate": 0.0},
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused(dataset, tmp_path, options):
+    with pytest.raises(OptionError):
+        pretrain(dataset, tmp_path / "out", **options)
