@@ -54,6 +54,10 @@ class Check:
     needed: str
     holds: bool
 
+    def __post_init__(self) -> None:
+        """Store a Python bool: NumPy's does not go into JSON."""
+        object.__setattr__(self, "holds", bool(self.holds))
+
 
 @dataclasses.dataclass(frozen=True)
 class Certificate:
