@@ -5,6 +5,7 @@ Rich draws where a person looks on; a pipe or a log file gets plain lines.
 
 import contextlib
 import json
+import math
 import re
 import sys
 import time
@@ -97,3 +98,52 @@ def _plain_progress(what: str, total: int) -> Callable[..., None]:
             print(f"{what}: {done}/{total}, {words}{left:.0f} s left", file=sys.stderr, flush=True)
 
     return advance
+
+
+@contextlib.contextmanager
+def meter() -> Iterator[Callable[[str, float, str], None]]:
+    """Show how far work has come whose own code knows the share done and the time left.
+
+    Yields:
+        A function to call often, with the stage, the share of it that is done (0 to 1), and a few
+        words such as rate and time left.
+    """
+    if not sys.stderr.isatty():
+        yield _plain_meter()
+        return
+    from rich import progress as rich_progress
+    from rich.console import Console
+
+    bar = rich_progress.Progress(
+        rich_progress.TextColumn("{task.description}"),
+        rich_progress.BarColumn(),
+        rich_progress.TaskProgressColumn(),
+        rich_progress.TextColumn("{task.fields[words]}"),
+        console=Console(stderr=True),
+    )
+    with bar:
+        stages: dict[str, rich_progress.TaskID] = {}
+
+        def update(stage: str, share: float, words: str) -> None:
+            if stage not in stages:
+                stages[stage] = bar.add_task(stage, total=1.0, words="")
+            bar.update(stages[stage], completed=share, words=words)
+
+        yield update
+
+
+def _plain_meter() -> Callable[[str, float, str], None]:
+    """A function that prints how far work has come every ten seconds and at a stage's end."""
+    last = -math.inf
+    ended: set[str] = set()
+
+    def update(stage: str, share: float, words: str) -> None:
+        nonlocal last
+        now = time.monotonic()
+        ends = share >= 1.0 and stage not in ended
+        if ends or now - last >= PLAIN_PROGRESS_PERIOD_S:
+            last = now
+            ended.update([stage] if ends else [])
+            print(f"{stage}: {100.0 * share:.0f} %, {words}", file=sys.stderr, flush=True)
+
+    return update

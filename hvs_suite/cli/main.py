@@ -9,6 +9,7 @@ import difflib
 import importlib
 import inspect
 import io
+import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -57,6 +58,7 @@ def run(arguments: Sequence[str]) -> int:
     Args:
         arguments: Words after ``hvs``.
     """
+    _quieten_libraries()
     try:
         return parse(arguments).run() or 0
     except SystemExit as end:  # the parser has printed help or its complaint
@@ -71,6 +73,14 @@ def run(arguments: Sequence[str]) -> int:
         # `hvs tasks | head` closed the pipe; the interpreter's own flush at exit would complain.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+
+
+def _quieten_libraries() -> None:
+    """Keep libraries from printing over our own progress, unless the user asked them to."""
+    # A bar for every episode that is written.
+    os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")
+    # Ninety lines of traceback where torchcodec finds no ffmpeg; `hvs doctor` says it in one.
+    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
 
 
 def complain(reason: str) -> None:

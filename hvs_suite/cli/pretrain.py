@@ -1,18 +1,13 @@
 """``hvs pretrain``: the ``hvs`` policy, trained on a dataset by behaviour cloning."""
 
-import contextlib
 import dataclasses
 import math
-import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hvs_suite.cli.console import PLAIN_PROGRESS_PERIOD_S
+from hvs_suite.cli import console
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
     from hvs_suite.policies.pretrain import Progress
 
 
@@ -46,9 +41,13 @@ class Pretrain:
         minutes = self.minutes
         if minutes is None and self.steps is None:
             minutes = DEFAULT_MINUTES
-        with _watch() as note:
+        with console.meter() as update:
             outcome = pretrain(
-                self.data, self.out, minutes=minutes, steps=self.steps, on_progress=note
+                self.data,
+                self.out,
+                minutes=minutes,
+                steps=self.steps,
+                on_progress=lambda state: update(state.stage, state.share, _words(state)),
             )
         held_out = (
             "" if math.isnan(outcome.held_out_loss) else f", held out {outcome.held_out_loss:.4f}"
@@ -59,51 +58,6 @@ class Pretrain:
         )
         print(f"loss {outcome.loss:.4f}{held_out}")
         print(f"wrote {self.out}")
-
-
-@contextlib.contextmanager
-def _watch() -> "Iterator[Callable[[Progress], None]]":
-    """Show training as a bar in a terminal, and as a line every ten seconds elsewhere."""
-    if not sys.stderr.isatty():
-        yield _lines()
-        return
-    from rich import progress as rich_progress
-    from rich.console import Console
-
-    bar = rich_progress.Progress(
-        rich_progress.TextColumn("{task.description}"),
-        rich_progress.BarColumn(),
-        rich_progress.TaskProgressColumn(),
-        rich_progress.TextColumn("{task.fields[note]}"),
-        console=Console(stderr=True),
-    )
-    with bar:
-        tasks: dict[str, rich_progress.TaskID] = {}
-
-        def note(state: "Progress") -> None:
-            if state.stage not in tasks:
-                tasks[state.stage] = bar.add_task(state.stage, total=1.0, note="")
-            bar.update(tasks[state.stage], completed=state.share, note=_words(state))
-
-        yield note
-
-
-def _lines() -> "Callable[[Progress], None]":
-    """A function that prints how training goes, now and then."""
-    last = -math.inf
-
-    def note(state: "Progress") -> None:
-        nonlocal last
-        now = time.monotonic()
-        if now - last >= PLAIN_PROGRESS_PERIOD_S:
-            last = now
-            print(
-                f"{state.stage}: {100.0 * state.share:.0f} %, {_words(state)}",
-                file=sys.stderr,
-                flush=True,
-            )
-
-    return note
 
 
 def _words(state: "Progress") -> str:

@@ -1,7 +1,15 @@
 """``hvs record``: demonstrations of the expert as a LeRobot dataset."""
 
 import dataclasses
+import shlex
+import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hvs_suite.cli import console
+
+if TYPE_CHECKING:
+    from hvs_suite.datasets.recorder import Progress
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -16,6 +24,8 @@ class Record:
         out: Root folder of the dataset; must not exist or be empty, unless --resume is given.
         split: Name of the split the scenarios come from.
         resume: Go on with a recording that was interrupted.
+        noise: Standard deviation of a disturbance of the executed joint targets, far from the goal
+            (rad); the expert's own action stays the label.
         workers: Processes that play episodes.
     """
 
@@ -24,7 +34,34 @@ class Record:
     out: Path
     split: str = "train"
     resume: bool = False
+    noise: float = 0.0
     workers: int = 1
 
     def run(self) -> None:
-        """Record, and say what was recorded."""
+        """Record, showing how it goes, and say what was recorded."""
+        from hvs_suite.datasets.recorder import record
+
+        with console.meter() as update:
+            done = record(
+                self.task,
+                self.episodes,
+                self.split,
+                self.out,
+                workers=self.workers,
+                noise=self.noise,
+                resume=self.resume,
+                progress=lambda state: update(
+                    "recording", state.episodes / state.total, _words(state)
+                ),
+                command=shlex.join(["hvs", *sys.argv[1:]]),
+            )
+        print(f"{done.episodes} episodes, {done.successes} of them solved; wrote {self.out}")
+
+
+def _words(state: "Progress") -> str:
+    """Count, rate and time left, in words."""
+    left = "" if state.remaining_s is None else f", {state.remaining_s:.0f} s left"
+    return (
+        f"{state.episodes}/{state.total}, {state.successes} solved, "
+        f"{state.episodes_per_s:.1f} episodes/s{left}"
+    )

@@ -151,11 +151,12 @@ def test_every_package_that_is_imported_is_declared():
                 imported.add(node.module.partition(".")[0])
     foreign = imported - set(sys.stdlib_module_names) - {"hvs_suite"}
     declared = {requirement.name for requirement in declared_requirements()}
-    packages = packages_distributions()
+    # These install below their own prefix, so their metadata does not list their modules.
+    packages = packages_distributions() | {"coal": ["coal"], "pinocchio": ["pin"]}
     assert [
         module
         for module in sorted(foreign)
-        if not declared & {name.lower() for name in packages[module]}
+        if not declared & {name.lower().replace("_", "-") for name in packages[module]}
     ] == []
 
 
