@@ -165,24 +165,22 @@ class Expert:
             return q  # Out of reach: stand still.
         required = min(CLEARANCE_M, self._kinematics.clearance(q) - 1e-3)
         rejected: list[FloatArray] = []
-        best: tuple[float, ruckig.Trajectory] | None = None
+        best: tuple[float, FloatArray] = (-np.inf, q)
         for goal in candidates:
             if any(np.abs(goal - other).max() < _DISTINCT_RAD for other in rejected):
                 continue
             motion = self._motion(q, velocity, goal)
             least = self._least_clearance(motion, required)
-            if best is None or least > best[0]:
-                best = (least, motion)
+            if least > best[0]:
+                # The arm trails its set point by the lag, so the set point leads by it.
+                ahead = min(self._period_s + _LAG_S, motion.duration)
+                best = (least, np.asarray(motion.at_time(ahead)[0]))
             if least >= required:
                 break
             rejected.append(goal)
             if len(rejected) >= _MAX_PATHS:
                 break
-        assert best is not None
-        motion = best[1]
-        # The arm trails its set point by the lag, so the set point leads by it.
-        ahead = min(self._period_s + _LAG_S, motion.duration)
-        return np.asarray(motion.at_time(ahead)[0])
+        return best[1]
 
     def _ranked_goals(
         self, q: FloatArray, velocity: FloatArray, position: FloatArray, normal: FloatArray

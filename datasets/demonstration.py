@@ -1,0 +1,120 @@
+"""One demonstration: the expert plays a scenario, and every frame of it is kept."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+import hvs_suite
+from hvs_suite.cell.robot import JOINT_RANGE_RAD
+from hvs_suite.datasets.features import Frame, acted_part, observed_part
+from hvs_suite.rollout import Policy
+
+if TYPE_CHECKING:
+    from hvs_suite.cell.environment import Environment
+
+NOISE_STREAM = "demonstration-noise"
+NOISE_TIME_S = 0.3
+"""Correlation time of the perturbation: long enough to lead the arm astray, not only shake it."""
+NOISE_FULL_DISTANCE_M = 0.2
+"""Distance to the goal from which on the perturbation has its full size (m)."""
+NOISE_FLOOR = 0.02
+"""Share of it that is left at the goal, so that the last millimetres are demonstrated as well."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Demonstration:
+    """One played scenario.
+
+    Attributes:
+        scenario: Index in the split.
+        frames: One a control step, each the columns of :mod:`hvs_suite.datasets.features`.
+        success: The goal was reached.
+        collision: A forbidden contact ended it.
+    """
+
+    scenario: int
+    frames: list[Frame]
+    success: bool
+    collision: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class MakeEnvironment:
+    """Loads the task to record; travels to worker processes.
+
+    Attributes:
+        task: Registered name.
+        split: Stream of scenarios.
+        options: Options of the task.
+    """
+
+    task: str
+    split: str
+    options: Mapping[str, Any]
+
+    def __call__(self) -> "Environment":
+        """Loads it."""
+        return hvs_suite.load(self.task, split=self.split, **self.options)
+
+
+@dataclasses.dataclass(frozen=True)
+class Demonstrate:
+    """Plays scenarios with the expert; for :func:`hvs_suite.rollout.play`.
+
+    Attributes:
+        noise: Standard deviation of the perturbation of the executed joint targets, far from the
+            goal (rad); 0 executes what the expert says.
+    """
+
+    noise: float
+
+    def __call__(self, env: "Environment", expert: Policy, scenario: int) -> Demonstration:
+        """Plays one scenario to its end."""
+        time_step = env.reset(scenario=scenario)
+        expert.reset()
+        perturbation = _Perturbation(env, scenario, self.noise) if self.noise > 0.0 else None
+        frames: list[Frame] = []
+        while not time_step.last():
+            frame = observed_part(env.variant, time_step.observation, env)
+            action = expert.select_action(time_step.observation)
+            executed = action if perturbation is None else perturbation.apply(action)
+            time_step = env.step(executed)
+            frame |= acted_part(
+                action,
+                executed,
+                float(time_step.reward or 0.0),
+                time_step.last(),
+                env.info["is_success"],
+            )
+            frames.append(frame)
+        info = env.info
+        return Demonstration(scenario, frames, info["is_success"], info["collision"])
+
+
+class _Perturbation:
+    """An Ornstein-Uhlenbeck process on the joint targets that dwindles towards the goal.
+
+    x[k+1] = rho x[k] + sqrt(1 - rho^2) n, rho = exp(-period / correlation time); what is added is
+    noise * share * x, with share = distance / 0.2 m cut to [0.02, 1]. The draws come from the
+    scenario's own generator, so a demonstration depends on nothing but its index.
+    """
+
+    def __init__(self, env: "Environment", scenario: int, noise: float) -> None:
+        self._env = env
+        self._noise = noise
+        self._random = env.task.source.generator(NOISE_STREAM, scenario)
+        self._keep = math.exp(-env.variant.control_period_s / NOISE_TIME_S)
+        self._state = self._random.normal(size=len(JOINT_RANGE_RAD))
+
+    def apply(self, action: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """The action (7,) to execute instead; in [-1, 1]."""
+        distance = self._env.info["position_error_mm"] / 1000.0
+        share = min(1.0, max(NOISE_FLOOR, distance / NOISE_FULL_DISTANCE_M))
+        added = self._noise * share * self._state / JOINT_RANGE_RAD
+        fresh = self._random.normal(size=len(JOINT_RANGE_RAD))
+        self._state = self._keep * self._state + math.sqrt(1.0 - self._keep**2) * fresh
+        return np.clip(action + added, -1.0, 1.0).astype(np.float32)

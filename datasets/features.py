@@ -1,0 +1,155 @@
+"""The columns of a dataset: LeRobot's features, and the frame that fills them.
+
+========================================  ==============  ========================================
+feature                                   dtype, shape    meaning
+========================================  ==============  ========================================
+``observation.images.eih``, ``.eth``      image (H,W,3)   as the policy saw it
+``observation.state``                     float32 (14,)   measured positions (rad), then velocities
+``action``                                float32 (7,)    the expert's action for this frame
+``next.reward``                           float32 (1,)    reward of the control step that followed
+``next.done``, ``next.success``           bool (1,)       whether that step ended, or reached it
+``privileged.action_executed``            float32 (7,)    what was done; differs where noise was on
+``privileged.scenario``                   int64 (1,)      index in the split
+``privileged.goal_position``              float32 (3,)    of the flange at the goal (m, base frame)
+``privileged.goal_normal``                float32 (3,)    outward surface normal there
+``privileged.target_eih``, ``.target_eth``  float32 (4,)  target in the image: u, v, diameter, seen
+``privileged.errors``                     float32 (4,)    at this frame: mm, mm, mm, deg
+========================================  ==============  ========================================
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hvs_suite.errors import OptionError
+from hvs_suite.tasks.variants import AlignVariant, observation_names
+
+ROBOT_TYPE = "kuka_lbr_iiwa"
+# Spelled out rather than imported: robot.py loads MuJoCo, and reading a dataset must not.
+JOINT_NAMES = ("A1", "A2", "A3", "A4", "A5", "A6", "A7")
+CAMERAS = ("eih", "eth")
+ERROR_NAMES = ("position_error_mm", "lateral_error_mm", "height_error_mm", "tilt_error_deg")
+PRIVILEGED_VECTORS = ("goal_position", "goal_normal", "target_eih", "target_eth")
+
+STATE = "observation.state"
+ACTION = "action"
+ACTION_EXECUTED = "privileged.action_executed"
+SCENARIO = "privileged.scenario"
+ERRORS = "privileged.errors"
+
+_STATE_SUFFIX = {"joint_positions": "pos", "joint_velocities": "vel"}
+
+Frame = dict[str, npt.NDArray[Any]]
+
+
+def image_key(camera: str) -> str:
+    """Feature of a camera's images."""
+    return f"observation.images.{camera}"
+
+
+def dataset_features(variant: AlignVariant) -> dict[str, dict[str, Any]]:
+    """The features of a dataset of this task, in LeRobot's form.
+
+    Raises:
+        OptionError: The task observes what a LeRobot dataset cannot hold, or takes other actions
+            than the expert's.
+    """
+    names = observation_names(variant.observations)
+    channels = {"eih": variant.eih_channels, "eth": variant.eth_channels}
+    unfit = [name for name in names if name not in (*CAMERAS, *_STATE_SUFFIX)]
+    unfit += [f"{name}_channels=1" for name in names if channels.get(name, 3) != 3]
+    unfit += ["normalise_observation=True"] if variant.normalise_observation else []
+    unfit += [] if variant.action_mode == "joint_position" else [f"{variant.action_mode} actions"]
+    if unfit:
+        raise OptionError(
+            "a dataset holds uint8 RGB images, joint values in rad and joint_position actions; "
+            f"leave out {', '.join(unfit)}"
+        )
+    sides = {"eih": variant.eih_resolution, "eth": variant.eth_resolution}
+    features: dict[str, dict[str, Any]] = {
+        image_key(name): {
+            "dtype": "image",
+            "shape": (sides[name], sides[name], 3),
+            "names": ["height", "width", "channels"],
+        }
+        for name in names
+        if name in CAMERAS
+    }
+    state = [f"{joint}.{_STATE_SUFFIX[n]}" for n in _state_names(variant) for joint in JOINT_NAMES]
+    if state:
+        features[STATE] = _vector(state)
+    features[ACTION] = _vector([f"{joint}.pos" for joint in JOINT_NAMES])
+    features["next.reward"] = _scalar("float32", "reward")
+    features["next.done"] = _scalar("bool", "done")
+    features["next.success"] = _scalar("bool", "success")
+    features[ACTION_EXECUTED] = _vector([f"{joint}.pos" for joint in JOINT_NAMES])
+    features[SCENARIO] = _scalar("int64", "scenario")
+    features["privileged.goal_position"] = _vector(["x", "y", "z"])
+    features["privileged.goal_normal"] = _vector(["x", "y", "z"])
+    for camera in CAMERAS:
+        features[f"privileged.target_{camera}"] = _vector(["u", "v", "diameter", "visible"])
+    features[ERRORS] = _vector(list(ERROR_NAMES))
+    return features
+
+
+def observed_part(
+    variant: AlignVariant, observation: Mapping[str, npt.NDArray[Any]], environment: Any
+) -> Frame:
+    """The columns that are known before the action: observation and privileged values.
+
+    Args:
+        variant: The task's parameters.
+        observation: What the policy sees.
+        environment: The environment in that state.
+    """
+    frame: Frame = {image_key(name): observation[name] for name in CAMERAS if name in observation}
+    names = _state_names(variant)
+    if names:
+        frame[STATE] = np.concatenate([observation[name] for name in names]).astype(np.float32)
+    truth, info = environment.privileged(), environment.info
+    for name in PRIVILEGED_VECTORS:
+        frame[f"privileged.{name}"] = truth[name].astype(np.float32)
+    frame[ERRORS] = np.array([info[name] for name in ERROR_NAMES], np.float32)
+    frame[SCENARIO] = np.array([info["scenario"]], np.int64)
+    return frame
+
+
+def acted_part(
+    action: npt.NDArray[np.float32],
+    executed: npt.NDArray[np.float32],
+    reward: float,
+    done: bool,
+    success: bool,
+) -> Frame:
+    """The columns that are known after the control step.
+
+    Args:
+        action: The expert's action (7,).
+        executed: The action done (7,).
+        reward: Reward of the step.
+        done: The step ended the episode.
+        success: The step reached the goal.
+    """
+    return {
+        ACTION: action,
+        ACTION_EXECUTED: executed,
+        "next.reward": np.array([reward], np.float32),
+        "next.done": np.array([done], np.bool_),
+        "next.success": np.array([success], np.bool_),
+    }
+
+
+def _state_names(variant: AlignVariant) -> list[str]:
+    """The joint observations of a task, positions first."""
+    names = observation_names(variant.observations)
+    return [name for name in _STATE_SUFFIX if name in names]
+
+
+def _vector(names: list[str]) -> dict[str, Any]:
+    return {"dtype": "float32", "shape": (len(names),), "names": names}
+
+
+def _scalar(dtype: str, name: str) -> dict[str, Any]:
+    return {"dtype": dtype, "shape": (1,), "names": [name]}

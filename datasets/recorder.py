@@ -1,0 +1,243 @@
+"""Recording: the expert's demonstrations of a task as one LeRobot dataset.
+
+Workers play scenarios and render; this process alone imports LeRobot and writes. Episode i of the
+dataset is scenario i of the split, whatever the number of workers and however often the recording
+was interrupted.
+"""
+
+import contextlib
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from hvs_suite.datasets.features import dataset_features
+from hvs_suite.datasets.metadata import (
+    METADATA_FILE,
+    DatasetMetadata,
+    jsonable,
+    read_metadata,
+    write_metadata,
+)
+from hvs_suite.errors import DatasetError, HvsError, OptionError, OutputError, ScenarioError
+from hvs_suite.registry import find
+from hvs_suite.rollout import play
+from hvs_suite.tasks.variants import with_options
+
+BLOCK_EPISODES = 50
+"""Episodes between two publications: what a kill can cost."""
+TEST_SPLIT = "test"
+TEST_SCENARIOS = 1000
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Progress:
+    """How far a recording has come.
+
+    Attributes:
+        episodes: Episodes written, earlier sessions included.
+        total: Episodes asked for.
+        successes: Those of them that reached the goal.
+        frames: Frames written in this session.
+        episodes_per_s: Rate of this session, from its first episode on.
+        remaining_s: Time left at that rate (s); None before there is one.
+    """
+
+    episodes: int
+    total: int
+    successes: int
+    frames: int
+    episodes_per_s: float
+    remaining_s: float | None
+
+
+def record(
+    task: str,
+    episodes: int,
+    split: str,
+    out: str | Path,
+    options: Mapping[str, Any] | None = None,
+    *,
+    workers: int = 1,
+    noise: float = 0.0,
+    resume: bool = False,
+    progress: Callable[[Progress], None] | None = None,
+    command: str = "",
+    block: int = BLOCK_EPISODES,
+) -> Progress:
+    """Records scenarios 0 to ``episodes`` - 1 of a split; failures are kept and marked.
+
+    Args:
+        task: Registered name.
+        episodes: Episodes the dataset shall hold in the end.
+        split: Stream of scenarios.
+        out: Root of the dataset; missing or empty, unless ``resume``.
+        options: Options of the task, start distributions among them.
+        workers: Processes that play; 1 plays in this one.
+        noise: Standard deviation of the temporally correlated perturbation of the executed joint
+            targets, far from the goal (rad). The expert's own action stays the label.
+        resume: Go on after the last published episode.
+        progress: Called after each episode.
+        command: What to write into ``hvs.json`` as the command that made the dataset.
+        block: Episodes between two publications.
+
+    Returns:
+        The final progress.
+
+    Raises:
+        UnknownTaskError: There is no such task.
+        OptionError: An option or a number makes no sense.
+        ScenarioError: The split holds fewer scenarios.
+        OutputError: ``out`` is not empty without ``resume``, or cannot be written.
+        DatasetError: What ``resume`` found was recorded otherwise.
+    """
+    variant = with_options(find(task), dict(options or {}))
+    features = dataset_features(variant)
+    _check_numbers(episodes, split, noise, block)
+    root = Path(out)
+    metadata = DatasetMetadata(
+        task=task,
+        task_version=variant.version,
+        split=split,
+        options=jsonable(options or {}),
+        noise=float(noise),
+        command=command,
+    )
+    # PyArrow and the simulator load only once the arguments have passed.
+    from hvs_suite.datasets.demonstration import Demonstrate, MakeEnvironment
+    from hvs_suite.datasets.expert import make_expert
+    from hvs_suite.datasets.writer import DatasetWriter, prepare_root, published_outcomes
+
+    if resume:
+        _check_same_recording(root, metadata)
+    prepare_root(root, resume=resume)
+    write_metadata(root, metadata)
+    outcomes = published_outcomes(root)
+    tracker = _Tracker(len(outcomes), sum(outcomes), episodes, progress)
+    fps = round(1.0 / variant.control_period_s)
+    writer = DatasetWriter(root, features, fps, variant.instruction, block)
+    played = play(
+        MakeEnvironment(task, split, dict(options or {})),
+        make_expert,
+        range(len(outcomes), episodes),
+        Demonstrate(noise),
+        workers=workers,
+    )
+    try:
+        with contextlib.closing(played):
+            for demonstration in _in_order(played, len(outcomes)):
+                writer.save(demonstration)
+                tracker.saved(len(demonstration.frames), demonstration.success)
+        writer.publish()
+    except KeyboardInterrupt:
+        writer.publish()
+        raise
+    except HvsError:
+        writer.publish()
+        raise
+    except OSError as error:
+        writer.discard()
+        saved = len(published_outcomes(root))
+        raise OutputError(
+            f"cannot write {root}: {error.strerror or error}; {saved} of {episodes} episodes are "
+            "saved, go on with --resume"
+        ) from error
+    return tracker.state()
+
+
+def _in_order[T: Any](demonstrations: Iterable[T], first: int) -> Iterator[T]:
+    """Demonstrations by scenario, holding back those that ended before their turn."""
+    waiting: dict[int, T] = {}
+    turn = first
+    for demonstration in demonstrations:
+        waiting[demonstration.scenario] = demonstration
+        while turn in waiting:
+            yield waiting.pop(turn)
+            turn += 1
+
+
+class _Tracker:
+    """Counts episodes and estimates the time left."""
+
+    def __init__(
+        self,
+        episodes: int,
+        successes: int,
+        total: int,
+        progress: Callable[[Progress], None] | None,
+    ) -> None:
+        self._before = self._episodes = episodes
+        self._successes = successes
+        self._total = total
+        self._frames = 0
+        self._progress = progress
+        # Until the first episode is there, workers start and LeRobot loads: not part of the rate.
+        self._since: float | None = None
+
+    def saved(self, frames: int, success: bool) -> None:
+        """Counts one episode and reports."""
+        self._episodes += 1
+        self._successes += success
+        self._frames += frames
+        if self._since is None:
+            self._since = time.monotonic()
+        if self._progress is not None:
+            self._progress(self.state())
+
+    def state(self) -> Progress:
+        """The progress now."""
+        elapsed = 0.0 if self._since is None else time.monotonic() - self._since
+        counted = self._episodes - self._before - 1
+        rate = counted / elapsed if counted > 0 and elapsed > 0.0 else 0.0
+        return Progress(
+            episodes=self._episodes,
+            total=self._total,
+            successes=self._successes,
+            frames=self._frames,
+            episodes_per_s=rate,
+            remaining_s=(self._total - self._episodes) / rate if rate > 0.0 else None,
+        )
+
+
+def _check_numbers(episodes: int, split: str, noise: float, block: int) -> None:
+    """Refuses counts and noise that make no sense."""
+    if episodes < 1:
+        raise OptionError(f"episodes is {episodes}; record at least 1")
+    if not split.strip():
+        raise ScenarioError("a split is a name such as 'train'; name one with --split")
+    if split == TEST_SPLIT and episodes > TEST_SCENARIOS:
+        raise ScenarioError(
+            f"split 'test' holds {TEST_SCENARIOS} scenarios, not {episodes}; record fewer, or "
+            "--split train"
+        )
+    if not math.isfinite(noise) or noise < 0.0:
+        raise OptionError(f"noise is {noise}; use a standard deviation in rad from 0 up")
+    if block < 1:
+        raise OptionError(f"block is {block}; publish every 1 or more episodes")
+
+
+def _check_same_recording(root: Path, metadata: DatasetMetadata) -> None:
+    """Refuses to go on with a dataset of other demonstrations.
+
+    Raises:
+        OutputError: The folder holds something that is no recording.
+        DatasetError: It holds another recording.
+    """
+    if not root.is_dir() or not any(root.iterdir()):
+        return
+    if not (root / METADATA_FILE).exists():
+        raise OutputError(f"{root} holds no recording to resume; choose another folder")
+    found = read_metadata(root)
+    if not found.same_recording(metadata):
+        names = [
+            field.name
+            for field in dataclasses.fields(metadata)
+            if field.name != "command"
+            and getattr(found, field.name) != getattr(metadata, field.name)
+        ]
+        raise DatasetError(
+            f"{root} was recorded with another {', '.join(names)}; resume with the same, or "
+            "choose another folder"
+        )
