@@ -115,6 +115,7 @@ class ScenarioSource:
 
     Raises:
         ScenarioError: The split's name is empty.
+        OptionError: The goal that was asked for is out of reach.
     """
 
     def __init__(self, variant: AlignVariant, split: str, surface: Any) -> None:
@@ -131,6 +132,11 @@ class ScenarioSource:
         }
         text = json.dumps(identity, sort_keys=True, default=list)
         self._key = int.from_bytes(hashlib.sha256(text.encode()).digest()[:16], "little")
+        if isinstance(variant.goal, tuple) and not self._is_reachable(*variant.goal):
+            raise OptionError(
+                f"goal {variant.goal} is out of the arm's reach, {variant.standoff_m} m off the "
+                "surface; choose a radius from 0.40 to 0.78 m"
+            )
 
     def check(self, index: Any) -> int:
         """Return the index as an int.
@@ -220,13 +226,24 @@ class ScenarioSource:
         elif isinstance(goal, str):
             # "fixed" is drawn once a split: from a stream of its own that ignores the index.
             random = self.generator(f"target-{goal}", index if goal == "random" else 0)
-            radius = math.sqrt(random.uniform(inner**2, outer**2))
-            azimuth = random.uniform(-math.pi, math.pi)
-            x, y = radius * math.cos(azimuth), radius * math.sin(azimuth)
+            for _ in range(_MAX_REDRAWS):
+                radius = math.sqrt(random.uniform(inner**2, outer**2))
+                azimuth = random.uniform(-math.pi, math.pi)
+                x, y = radius * math.cos(azimuth), radius * math.sin(azimuth)
+                # The ring is what the arm reaches over a flat surface; others lie partly lower.
+                if self._variant.surface == "flat" or self._is_reachable(x, y):
+                    break
+            else:
+                raise OptionError(f"no target within reach found for scenario {index}")
         else:
             x, y = goal
         height = self._surface.height(x, y)
         return np.array([x, y, height]), self._surface.normal(x, y)
+
+    def _is_reachable(self, x: float, y: float) -> bool:
+        target, normal = np.array([x, y, self._surface.height(x, y)]), self._surface.normal(x, y)
+        goal = target + normal * self._variant.standoff_m
+        return bool(len(kinematics().goal_configurations_at_tool_angle(goal, normal, 0.0)))
 
     def _start(self, index: int, target: FloatArray, normal: FloatArray) -> FloatArray:
         start = self._variant.start
@@ -239,10 +256,20 @@ class ScenarioSource:
         if start == "random":
             return self._random_start(index, target, normal)
         if start == "fixed":
-            return self._random_start(0, target, normal)
+            return self._fixed_start()
         if start == "near_goal":
             return self._near_goal_start(index, target, normal)
         return np.array(start, dtype=np.float64)
+
+    def _fixed_start(self) -> FloatArray:
+        # Kept for all goals, so it cannot depend on one: clear of surface and self is all it is.
+        random = self.generator("start-fixed", 0)
+        bound = RANDOM_START_RANGE * JOINT_RANGE_RAD
+        for _ in range(_MAX_REDRAWS):
+            q = random.uniform(-bound, bound)
+            if self._clearance(q, self._floor_normal()) >= START_CLEARANCE_M:
+                return q
+        raise OptionError("no fixed start found that is clear of surface and self")
 
     def _random_start(self, index: int, target: FloatArray, normal: FloatArray) -> FloatArray:
         model, variant = kinematics(), self._variant
@@ -254,7 +281,7 @@ class ScenarioSource:
             q = random.uniform(-bound, bound)
             if np.linalg.norm(model.flange_pose(q)[1] - goal) < START_GOAL_DISTANCE_M:
                 continue
-            if model.clearance(q, self._variant_floor()) < START_CLEARANCE_M:
+            if self._clearance(q, self._floor_normal()) < START_CLEARANCE_M:
                 continue
             if steps_lower_bound(variant, q, goal, normal) <= steps:
                 return q
@@ -264,9 +291,8 @@ class ScenarioSource:
         )
 
     def _near_goal_start(self, index: int, target: FloatArray, normal: FloatArray) -> FloatArray:
-        model = kinematics()
         goal = target + normal * self._variant.standoff_m
-        reachable = model.goal_configurations_at_tool_angle(goal, normal, 0.0)
+        reachable = kinematics().goal_configurations_at_tool_angle(goal, normal, 0.0)
         if not len(reachable):
             raise OptionError(
                 f"scenario {index}: the goal {goal.round(3).tolist()} is out of reach"
@@ -281,17 +307,22 @@ class ScenarioSource:
             low, high = np.log(_NEAR_GOAL_SCALE_RAD)
             scale = math.exp(random.uniform(low, high))
             q = posture + random.normal(size=7) * scale * [0.5, 0.5, 0.5, 0.5, 1, 1, 2]
+            # No surface here bends up, so none rises above the plane that touches it at the target.
             if (np.abs(q) < JOINT_RANGE_RAD).all() and (
-                model.clearance(q, self._variant_floor()) >= _NEAR_GOAL_CLEARANCE_M
+                self._clearance(q, normal, target) >= _NEAR_GOAL_CLEARANCE_M
             ):
                 return q
         raise OptionError(f"no start near the goal found for scenario {index}")
 
-    def _variant_floor(self) -> float:
-        # The clearance query knows level surfaces only: take the highest point within reach.
-        if self._variant.surface == "tilted":
-            return max(self._surface.height(x, 0.0) for x in (-0.8, 0.8))
-        return 0.0
+    def _clearance(
+        self, q: FloatArray, normal: FloatArray, through: FloatArray | None = None
+    ) -> float:
+        height = 0.0 if through is None else float(through @ normal / normal[2])
+        return kinematics().clearance(q, height, normal)
+
+    def _floor_normal(self) -> FloatArray:
+        """Normal of the plane through the origin that the whole surface lies in or below."""
+        return np.asarray(self._surface.normal(0.0, 0.0))
 
     def _light(self, index: int) -> tuple[FloatArray | None, FloatArray]:
         if not self._variant.vary_light:

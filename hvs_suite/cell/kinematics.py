@@ -177,27 +177,34 @@ class Kinematics:
             ).copy()
         )
 
-    def clearance(self, q: npt.ArrayLike, surface_height_m: float = 0.0) -> float:
-        """Least distance (m) from links 2 to 7 to a level surface, and between distant links.
+    def clearance(
+        self,
+        q: npt.ArrayLike,
+        surface_height_m: float = 0.0,
+        surface_normal: npt.ArrayLike = (0.0, 0.0, 1.0),
+    ) -> float:
+        """Least distance (m) from links 2 to 7 to a plane surface, and between distant links.
 
         Uses the same collision geoms as MuJoCo; links less than three joints apart are not
         compared. Negative where bodies interpenetrate.
 
         Args:
             q: Configuration (7,) in rad.
-            surface_height_m: Height of the surface in the base frame (m).
+            surface_height_m: Height of the surface over the base frame's origin (m).
+            surface_normal: Its outward unit normal (3,), base frame.
         """
         q = np.asarray(q, dtype=np.float64)
+        normal = np.asarray(surface_normal, dtype=np.float64)
         pin.updateGeometryPlacements(self.model, self._data, self.geometry, self._geometry_data, q)
         placements = self._geometry_data.oMg
-        height = np.array([placements[i].translation[2] for i in self._movable])
-        axis_z = np.array([placements[i].rotation[2, 2] for i in self._movable])
+        height = np.array([placements[i].translation @ normal for i in self._movable])
+        axis_z = np.array([placements[i].rotation[:, 2] @ normal for i in self._movable])
         # A capsule's end is a ball; a cylinder's a disc, whose rim dips by r sin(tilt).
         dip = np.where(self._is_cylinder, np.sqrt(np.maximum(0.0, 1.0 - axis_z**2)), 1.0)
         lowest = height - self._half_length * np.abs(axis_z) - self._radius * dip
         pin.computeDistances(self.geometry, self._geometry_data)
         between = min(result.min_distance for result in self._geometry_data.distanceResults)
-        return float(min(between, lowest.min() - surface_height_m))
+        return float(min(between, lowest.min() - surface_height_m * normal[2]))
 
     def inverse_kinematics(
         self,

@@ -37,6 +37,7 @@ class Renderer:
         self, model: mujoco.MjModel, max_side: int, multisampling: int, *, studio: bool = False
     ) -> None:
         self._model = model
+        self._max_side = max_side
         self._gl = gl.create_context(max_side, max_side)
         # MjrContext takes its sizes from the model; these are the only fields it reads from there.
         model.vis.global_.offwidth = max_side
@@ -76,6 +77,9 @@ class Renderer:
 
         Returns:
             RGB picture, uint8 (H, W, 3), row 0 on top; the caller owns it.
+
+        Raises:
+            RenderError: The picture is larger than the renderer, or the renderer was closed.
         """
         rect = self._draw(data, camera, height, width)
         buffer = self._buffer(height, width, "colour")
@@ -139,6 +143,11 @@ class Renderer:
     def _draw(
         self, data: mujoco.MjData, camera: int | mujoco.MjvCamera, height: int, width: int
     ) -> mujoco.MjrRect:
+        if max(width, height) > self._max_side:
+            raise RenderError(
+                f"a picture of {width} x {height} px is larger than the {self._max_side} px that "
+                "this renderer was made for"
+            )
         self._make_current()
         if isinstance(camera, int):
             self._camera.fixedcamid = camera
