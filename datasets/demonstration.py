@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-import hvs_suite
 from hvs_suite.cell.robot import JOINT_RANGE_RAD
 from hvs_suite.datasets.features import Frame, acted_part, observed_part
+from hvs_suite.registry import load
 from hvs_suite.rollout import Policy
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class MakeEnvironment:
 
     def __call__(self) -> "Environment":
         """Loads it."""
-        return hvs_suite.load(self.task, split=self.split, **self.options)
+        return load(self.task, split=self.split, **self.options)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,7 +9,8 @@ A decision is:
 2. Rank the goal's whole redundant family (elbow swivel, mirror shapes, free yaw) by the least
    travel time from the present position and velocity under speed and acceleration limits.
 3. Take the first whose time-optimal motion (ruckig) keeps clear of surface and self.
-4. Command the point of that motion which the arm, trailing its set point, shall reach next.
+4. Command the point of that motion at the end of the control step, and a little further: the
+   arm trails its set point.
 """
 
 from __future__ import annotations
@@ -39,8 +40,12 @@ PROJECTION_RANGE_M = 0.15
 TIE_BREAK_S = 0.01
 """Price of unneeded motion: small against a control step, enough to make the choice unique."""
 
-_LAG_S = float(np.max(robot.DAMPING_NM_S_RAD / robot.STIFFNESS_NM_RAD))
-"""The joints trail a moving set point by kv / kp (s)."""
+LEAD_S = 0.025
+"""How far the set point runs ahead of the motion (s): a little less than the joints' lag, tuned for
+the fewest steps. More overshoots the goal, less arrives late."""
+
+_LAG_S: FloatArray = robot.DAMPING_NM_S_RAD / robot.STIFFNESS_NM_RAD
+"""Each joint trails a moving set point by kv / kp (s)."""
 _MAX_PATHS = 24
 _MAX_FLANGE_SPEED_M_S = 2.5
 _PATH_STEP_S = 0.02
@@ -172,8 +177,7 @@ class Expert:
             motion = self._motion(q, velocity, goal)
             least = self._least_clearance(motion, required)
             if least > best[0]:
-                # The arm trails its set point by the lag, so the set point leads by it.
-                ahead = min(self._period_s + _LAG_S, motion.duration)
+                ahead = min(self._period_s + LEAD_S, motion.duration)
                 best = (least, np.asarray(motion.at_time(ahead)[0]))
             if least >= required:
                 break

@@ -9,8 +9,12 @@
 as ``hvs_suite/<name>-v<version>``.
 """
 
+from hvs_suite.gym import register
 from hvs_suite.registry import load
 from hvs_suite.tasks.variants import TASKS
 
 __version__ = "0.1.0"
 __all__ = ["TASKS", "load"]
+
+# Gymnasium looks names up among those registered, and imports nothing by itself.
+register()

@@ -11,9 +11,8 @@ scene, and the renderer is made at the first reset, in whichever process that ha
 """
 
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
-import dm_env
 import gymnasium
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +21,9 @@ from gymnasium import spaces
 from hvs_suite.errors import OptionError
 from hvs_suite.registry import load
 from hvs_suite.tasks.variants import TASKS
+
+if TYPE_CHECKING:
+    import dm_env
 
 NAMESPACE = "hvs_suite"
 RENDER_SIDE_PX = 480
@@ -155,7 +157,7 @@ class AlignEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
         self._playing = False
         self._environment.close()
 
-    def _observation(self, time_step: dm_env.TimeStep) -> Observation:
+    def _observation(self, time_step: "dm_env.TimeStep") -> Observation:
         self._frame = None
         return {
             name: np.asarray(time_step.observation[name], dtype=space.dtype)
