@@ -218,7 +218,7 @@ def _draw_joints(draw: "ImageDraw", joints: npt.NDArray[np.float64], top: int) -
         y = top + row * ROW_HEIGHT
         middle = BAR_LEFT + BAR_WIDTH // 2
         at = middle + round(float(np.clip(angle / limit, -1.0, 1.0)) * BAR_WIDTH / 2)
-        bar_top = y + (ROW_HEIGHT - BAR_HEIGHT) // 2 - 2
+        bar_top = y + 5
         draw.text((MARGIN, y), name, INK, font(14, bold=True))
         draw.rectangle((BAR_LEFT, bar_top, BAR_LEFT + BAR_WIDTH, bar_top + BAR_HEIGHT), TRACK)
         draw.rectangle((min(middle, at), bar_top, max(middle, at), bar_top + BAR_HEIGHT), ORANGE)

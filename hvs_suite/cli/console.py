@@ -139,6 +139,8 @@ def _plain_meter() -> Callable[[str, float, str], None]:
 
     def update(stage: str, share: float, words: str) -> None:
         nonlocal last
+        # The last step of a timed stage ends a little after its time.
+        share = min(share, 1.0)
         now = time.monotonic()
         ends = share >= 1.0 and stage not in ended
         if ends or now - last >= PLAIN_PROGRESS_PERIOD_S:

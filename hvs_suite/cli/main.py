@@ -77,8 +77,6 @@ def run(arguments: Sequence[str]) -> int:
 
 def _quieten_libraries() -> None:
     """Keep libraries from printing over our own progress, unless the user asked them to."""
-    # A bar for every episode that is written.
-    os.environ.setdefault("HF_DATASETS_DISABLE_PROGRESS_BARS", "1")
     # Ninety lines of traceback where torchcodec finds no ffmpeg; `hvs doctor` says it in one.
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
 
