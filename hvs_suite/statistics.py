@@ -1,9 +1,19 @@
-"""Estimates and intervals that results report, each with its source. Imports no room."""
+"""Estimates, intervals and tests that results report, each with its source. Imports no room."""
 
+import dataclasses
+import math
 import statistics
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+N_RESAMPLES = 1000
+"""Bootstrap resamples: the ends of a 95 % interval come from 25 of them each."""
+# Resampled values held in memory at once.
+_CHUNK = 1 << 20
 
 
 def wilson_interval(n_success: int, n_total: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -30,8 +40,7 @@ def wilson_interval(n_success: int, n_total: int, confidence: float = 0.95) -> t
     """
     if not 0 <= n_success <= n_total or n_total < 1:
         raise ValueError(f"{n_success} successes in {n_total} trials are not possible.")
-    if not 0.0 < confidence < 1.0:
-        raise ValueError(f"confidence must lie between 0 and 1, not {confidence}.")
+    _check_confidence(confidence)
     z = statistics.NormalDist().inv_cdf(0.5 + confidence / 2)
     rate = n_success / n_total
     centre = rate + z**2 / (2 * n_total)
@@ -58,9 +67,7 @@ def interquartile_mean(values: npt.ArrayLike) -> float:
     Raises:
         ValueError: `values` is empty or not one-dimensional.
     """
-    ordered = np.sort(_vector(values))
-    cut = len(ordered) // 4
-    return float(np.mean(ordered[cut : len(ordered) - cut]))
+    return float(_interquartile_means(_vector(values)[None])[0])
 
 
 def percentile(values: npt.ArrayLike, percent: float) -> float:
@@ -79,7 +86,221 @@ def percentile(values: npt.ArrayLike, percent: float) -> float:
     return float(np.percentile(_vector(values), percent))
 
 
-def _vector(values: npt.ArrayLike) -> npt.NDArray[np.float64]:
+def interquartile_mean_interval(
+    strata: Sequence[npt.ArrayLike], confidence: float = 0.95, resamples: int = N_RESAMPLES
+) -> tuple[float, float]:
+    """Returns the stratified bootstrap interval of the interquartile mean.
+
+    Each stratum (the episodes of one task) is resampled with replacement on its own, so that every
+    resample holds as many episodes of each task as the data; the interquartile mean is then taken
+    over all of them together. The interval holds the middle `confidence` of these means. The same
+    values give the same interval, always.
+
+    Source: B. Efron, "Bootstrap methods: another look at the jackknife", Annals of Statistics 7
+    (1979) 1-26 (percentile interval); stratified as in R. Agarwal et al., NeurIPS 2021.
+
+    Args:
+        strata: One or more (n_k,), in any unit; a single task is a single stratum.
+        confidence: Coverage aimed at, in (0, 1).
+        resamples: Number of resamples.
+
+    Returns:
+        Lower and upper end, in the unit of the values.
+
+    Raises:
+        ValueError: A stratum is empty, there is none, or `confidence` is outside (0, 1).
+    """
+    _check_confidence(confidence)
+    if not strata:
+        raise ValueError("Give one or more strata.")
+    columns = [_vector(values) for values in strata]
+    means = np.concatenate(
+        [
+            _interquartile_means(
+                np.concatenate(
+                    [values[index] for values, index in zip(columns, indices, strict=True)], axis=1
+                )
+            )
+            for indices in _resampled([len(values) for values in columns], resamples)
+        ]
+    )
+    return _middle(means, confidence)
+
+
+@dataclasses.dataclass(frozen=True)
+class Difference:
+    """A difference between two policies over the same scenarios, first minus second.
+
+    Attributes:
+        estimate: In the unit of the values.
+        low: Lower end of its interval.
+        high: Upper end.
+        n: Pairs.
+    """
+
+    estimate: float
+    low: float
+    high: float
+    n: int
+
+
+def paired_difference(
+    first: npt.ArrayLike,
+    second: npt.ArrayLike,
+    confidence: float = 0.95,
+    resamples: int = N_RESAMPLES,
+) -> Difference:
+    """Returns the mean paired difference with its bootstrap interval.
+
+    Scenarios are resampled, not values: both policies' values of a scenario stay together, so what
+    makes a scenario hard for both cancels.
+
+    Source: B. Efron and R. Tibshirani, "An introduction to the bootstrap" (1993), chapters 8 and
+    13 (percentile interval).
+
+    Args:
+        first: (n,) of the first policy, by scenario.
+        second: (n,) of the second, the same scenarios in the same order.
+        confidence: Coverage aimed at, in (0, 1).
+        resamples: Number of resamples.
+
+    Raises:
+        ValueError: The lengths differ or are 0, or `confidence` is outside (0, 1).
+    """
+    _check_confidence(confidence)
+    ours, theirs = _vector(first), _vector(second)
+    if ours.shape != theirs.shape:
+        raise ValueError(f"Pairs need equal lengths, not {len(ours)} and {len(theirs)}.")
+    differences = ours - theirs
+    means = np.concatenate(
+        [differences[index].mean(axis=1) for (index,) in _resampled([len(ours)], resamples)]
+    )
+    low, high = _middle(means, confidence)
+    return Difference(float(differences.mean()), low, high, len(ours))
+
+
+def mcnemar(n_only_first: int, n_only_second: int) -> float:
+    """Returns the p-value of McNemar's exact test, two-sided.
+
+    Under the hypothesis that both policies are equally good, each scenario that only one of them
+    solves is a fair coin: ``p = min(1, 2 P(X <= min(b, c)))`` with X ~ Binomial(b + c, 1/2).
+    Scenarios that both or neither solve say nothing.
+
+    Source: Q. McNemar, "Note on the sampling error of the difference between correlated proportions
+    or percentages", Psychometrika 12 (1947) 153-157; the exact form is the sign test.
+
+    Args:
+        n_only_first: Scenarios that only the first policy solved (b).
+        n_only_second: Scenarios that only the second solved (c).
+
+    Raises:
+        ValueError: A count is negative.
+    """
+    if min(n_only_first, n_only_second) < 0:
+        raise ValueError("Counts cannot be negative.")
+    n = n_only_first + n_only_second
+    tail = sum(math.comb(n, k) for k in range(min(n_only_first, n_only_second) + 1))
+    # Whole numbers until the end: 2**n overflows a float from n = 1,024 on.
+    return min(1.0, 2 * tail / 2**n)
+
+
+def share_within(errors: npt.ArrayLike, tolerances: npt.ArrayLike) -> FloatArray:
+    """Returns the curve of success against tolerance: the empirical distribution of the errors.
+
+    Source: the empirical distribution function, F(x) = (number of errors <= x) / n; as "performance
+    profile" in R. Agarwal et al., NeurIPS 2021.
+
+    Args:
+        errors: (n,) with n >= 1; infinity for an episode that no tolerance makes a success.
+        tolerances: (m,), in the unit of the errors.
+
+    Returns:
+        (m,) percent.
+    """
+    ordered = np.sort(_vector(errors))
+    within = np.searchsorted(ordered, np.asarray(tolerances, np.float64), side="right")
+    return np.asarray(100.0 * within / len(ordered), np.float64)
+
+
+def sharpest_tolerance(errors: npt.ArrayLike, percent: float = 95.0) -> float:
+    """Returns the smallest tolerance that at least `percent` of the errors meet.
+
+    It is the ceil(percent/100 * n)-th smallest error: definition 1 of Hyndman and Fan (1996), the
+    inverse of the empirical distribution, which unlike the interpolated percentile is always met.
+
+    Args:
+        errors: (n,) with n >= 1; infinity for an episode that no tolerance makes a success.
+        percent: Share that must meet it, in (0, 100].
+
+    Returns:
+        In the unit of the errors; infinity if fewer than `percent` are finite.
+    """
+    if not 0.0 < percent <= 100.0:
+        raise ValueError(f"percent must lie in (0, 100], not {percent}.")
+    ordered = np.sort(_vector(errors))
+    # The quotient first: 95 / 100 * 20 is a little more than 19 in floating point.
+    rank = math.ceil(percent * len(ordered) / 100.0 - 1e-9)
+    return float(ordered[max(rank, 1) - 1])
+
+
+def share_solved_by(steps_to_goal: Sequence[int | None], limit: int) -> FloatArray:
+    """Returns the curve of success against steps.
+
+    Every episode that has not reached its goal by a step, for whatever reason, counts as not
+    solved: nothing is censored, since all episodes have the same limit.
+
+    Args:
+        steps_to_goal: Control steps to success of each episode, None for failures.
+        limit: Time limit (control steps).
+
+    Returns:
+        (limit,) percent solved within 1, 2, ... limit control steps.
+    """
+    steps = [math.inf if count is None else count for count in steps_to_goal]
+    return share_within(steps, np.arange(1, limit + 1))
+
+
+def _interquartile_means(rows: FloatArray) -> FloatArray:
+    """Interquartile mean of each row of (m, n), as (m,)."""
+    n = rows.shape[1]
+    cut = n // 4
+    # Only the middle half must be told apart from the rest, not sorted.
+    kth = sorted({cut, n - cut - 1})
+    middle: FloatArray = np.partition(rows, kth, axis=1)[:, cut : n - cut]
+    # A fixed order of summation keeps the last digits independent of the partition's.
+    return np.asarray(np.sort(middle, axis=1).mean(axis=1), np.float64)
+
+
+def _resampled(lengths: Sequence[int], resamples: int) -> Iterator[list[npt.NDArray[np.int64]]]:
+    """Indices of bootstrap resamples, one (m, n_k) array a stratum, in blocks that fit in memory.
+
+    They come from the bit generator itself: NumPy promises that its stream never changes, which it
+    does not for the distributions above it. The bias of the remainder is below n / 2^64.
+    """
+    stream = np.random.Philox(key=0)
+    total = sum(lengths)
+    block = max(1, _CHUNK // total)
+    for begin in range(0, resamples, block):
+        rows = min(block, resamples - begin)
+        raw = stream.random_raw(rows * total).reshape(rows, total)
+        ends = np.cumsum(lengths)
+        yield [
+            (raw[:, end - n : end] % np.uint64(n)).astype(np.int64)
+            for n, end in zip(lengths, ends, strict=True)
+        ]
+
+
+def _middle(values: FloatArray, confidence: float) -> tuple[float, float]:
+    low, high = np.percentile(values, [50 - 50 * confidence, 50 + 50 * confidence])
+    return float(low), float(high)
+
+
+def _check_confidence(confidence: float) -> None:
+    if not 0.0 < confidence < 1.0:
+        raise ValueError(f"confidence must lie between 0 and 1, not {confidence}.")
+
+
+def _vector(values: npt.ArrayLike) -> FloatArray:
     """Returns values as (n,) float64, n >= 1."""
     vector = np.asarray(values, dtype=np.float64)
     if vector.ndim != 1 or not vector.size:

@@ -185,7 +185,7 @@ class Align(ServoTask):
         self._inside_once = self._inside_once or inside
         self._collision = collided
         self._success = self._n_inside >= self.variant.hold_steps
-        self._truncated = at_time_limit and not (self._success or self._collision)
+        self._truncated = at_time_limit and not self._is_final
 
         self._reward_terms = rewards.reward_terms(
             self.variant,
@@ -211,17 +211,21 @@ class Align(ServoTask):
     def get_discount(self, physics: mjcf.Physics) -> float:
         """0 after goal or collision; truncation is no end of the world and keeps the discount."""
         del physics
-        return 0.0 if self._success or self._collision else self.variant.discount
+        return 0.0 if self._is_final else self.variant.discount
 
     @property
     def has_ended(self) -> bool:
-        """Goal, collision or time limit."""
-        return self._success or self._collision or self._truncated
+        """Goal (unless the environment plays on), collision or time limit."""
+        return self._is_final or self._truncated
 
     def should_terminate_episode(self, physics: mjcf.Physics) -> bool:
         """Goal or collision; the time limit is the environment's."""
         del physics
-        return self._success or self._collision
+        return self._is_final
+
+    @property
+    def _is_final(self) -> bool:
+        return self._collision or (self._success and self.environment.goal_ends_episode)
 
     def action_spec(self, physics: mjcf.Physics) -> specs.BoundedArray:
         """Numbers in [-1, 1]; meaning in ``actions.set_point``."""
@@ -350,6 +354,19 @@ class Align(ServoTask):
     def pending_setpoints(self) -> list[FloatArray]:
         """True set points that were commanded and still wait out the latency, oldest first."""
         return [target - self.scenario.joint_offset for target in self._queue]
+
+    def landing_mm(self, physics: mjcf.Physics) -> FloatArray:
+        """Where the flange's centre stands over the target, in the target plane.
+
+        Returns:
+            (2,) mm: along the base's x axis as the plane shows it, and across it (normal times
+            that); its norm is ``lateral_error_mm``.
+        """
+        normal = self.scenario.normal
+        along = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
+        along /= np.linalg.norm(along)
+        offset = 1000.0 * (self.flange_position(physics) - self.scenario.target)
+        return np.array([offset @ along, offset @ np.cross(normal, along)])
 
     def commandable(self, q: npt.ArrayLike) -> npt.NDArray[np.float32]:
         """The ``joint_position`` action that sends the arm to true joint angles.

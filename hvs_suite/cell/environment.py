@@ -75,6 +75,8 @@ class Environment(composer.Environment):
 
     Attributes:
         clip_actions: Clip and count action values outside [-1, 1] instead of refusing them.
+        goal_ends_episode: False lets an episode go on past its goal to the time limit, so that one
+            can see where a policy settles. Never changes a scene.
 
     Args:
         task: The task.
@@ -83,6 +85,7 @@ class Environment(composer.Environment):
 
     def __init__(self, task: ServoTask, seed: int | None = None) -> None:
         self.clip_actions = False
+        self.goal_ends_episode = True
         self._physics: Any = None
         self._renderer: Renderer | None = None
         self._studio: dict[int, Renderer] = {}
@@ -250,6 +253,12 @@ class Environment(composer.Environment):
         """The ``joint_position`` action that sends the arm to true joint angles (7,) rad."""
         action: npt.NDArray[np.float32] = self.task.commandable(q)
         return action
+
+    @property
+    def landing_mm(self) -> FloatArray:
+        """Where the flange axis stands over the target now, (2,) mm; see ``Align.landing_mm``."""
+        landing: FloatArray = self.task.landing_mm(self._physics_proxy)
+        return landing
 
     def privileged(self) -> dict[str, FloatArray]:
         """What only training and the expert may see; keys as in ``Align.privileged``."""
