@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
+from hvs_suite.datasets.metadata import read_metadata
 from hvs_suite.errors import DatasetError
 from hvs_suite.policies.frame_cache import Frames, OnFrames, cached_frames, data_files
 from hvs_suite.policies.hvs.geometry import Calibration, calibrate
@@ -80,19 +81,19 @@ def read_manifest(root: Path) -> Manifest:
         DatasetError: There is no such dataset, it is empty, or it was not recorded by this suite.
     """
     info = _read_json(root / "meta" / "info.json", f"{root} is not a LeRobot dataset")
-    ours = _read_json(root / "hvs.json", f"{root} was not recorded with hvs record")
+    origin = read_metadata(root)
     try:
         manifest = Manifest(
             root=root,
-            task=str(ours["task"]),
-            split=str(ours["split"]),
-            options=dict(ours.get("options") or {}),
+            task=origin.task,
+            split=origin.split,
+            options=origin.options,
             features=info["features"],
             n_frames=int(info["total_frames"]),
             n_episodes=int(info["total_episodes"]),
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise DatasetError(f"{root}: hvs.json or meta/info.json lacks {error}") from error
+        raise DatasetError(f"{root}: meta/info.json lacks {error}") from error
     if manifest.n_frames == 0:
         raise DatasetError(f"{root} is empty; record at least two episodes")
     return manifest

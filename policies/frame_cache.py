@@ -9,6 +9,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -83,7 +84,8 @@ def cached_frames(
         if json.loads(made_from.read_text()) == stamp:
             return _open(path)
     made_from.unlink(missing_ok=True)
-    frames = np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=(n_frames, *shape))
+    open_memmap: Any = np.lib.format.open_memmap  # untyped in NumPy's stubs
+    frames = open_memmap(path, mode="w+", dtype=np.uint8, shape=(n_frames, *shape))
     done = 0
     for encoded in _encoded(root, key):
         if done >= n_frames:
@@ -104,7 +106,7 @@ def cached_frames(
 
 
 def _open(path: Path) -> Frames:
-    return np.load(path, mmap_mode="r", allow_pickle=False)  # type: ignore[no-any-return]
+    return np.load(path, mmap_mode="r", allow_pickle=False)
 
 
 def _encoded(root: Path, key: str) -> Iterator[bytes]:

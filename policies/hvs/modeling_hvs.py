@@ -3,10 +3,10 @@
 import json
 import logging
 from pathlib import Path
-from typing import Any, Unpack, cast
+from typing import Any
 
 import torch
-from lerobot.policies.pretrained import ActionSelectKwargs, PreTrainedPolicy
+from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
@@ -26,7 +26,7 @@ TARGET_PREFIX = "privileged.target_"
 logger = logging.getLogger(__name__)
 
 
-class HvsPolicy(PreTrainedPolicy):  # type: ignore[misc]
+class HvsPolicy(PreTrainedPolicy):
     """Two images and the joints in, seven joint position targets out.
 
     Args:
@@ -102,19 +102,15 @@ class HvsPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return loss, {name: part.item() for name, part in parts.items()}
 
     @torch.no_grad()
-    def predict_action_chunk(
-        self, batch: dict[str, Tensor], **kwargs: Unpack[ActionSelectKwargs]
-    ) -> Tensor:
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Chunk of one action, (B, 1, 7) in [-1, 1]."""
         self.eval()
         images, state = self._inputs(batch)
         out = self.network(images, state)[0]
-        return cast(Tensor, self.network.to_action(out, state))[:, None]
+        return self.network.to_action(out, state)[:, None]
 
     @torch.no_grad()
-    def select_action(
-        self, batch: dict[str, Tensor], **kwargs: Unpack[ActionSelectKwargs]
-    ) -> Tensor:
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Joint position targets in units of the joint range, (B, 7) in [-1, 1].
 
         Args:

@@ -141,12 +141,11 @@ class Eye(nn.Module):
         # A mean over cells cannot reach the border, and strides shift it by a fraction of a cell.
         self.uv_scale = nn.Parameter(torch.full((2,), 1.05))
         self.uv_shift = nn.Parameter(torch.zeros(2))
-        self.size_and_visibility = nn.Sequential(
-            nn.Linear(2 * channels + 5, 64), nn.SiLU(), nn.Linear(64, 2)
-        )
-        nn.init.zeros_(self.size_and_visibility[2].weight)
+        last = nn.Linear(64, 2)
+        nn.init.zeros_(last.weight)
         with torch.no_grad():
-            self.size_and_visibility[2].bias.copy_(torch.tensor([math.log(0.15), 0.0]))
+            last.bias.copy_(torch.tensor([math.log(0.15), 0.0]))
+        self.size_and_visibility = nn.Sequential(nn.Linear(2 * channels + 5, 64), nn.SiLU(), last)
 
     def forward(self, images: Tensor) -> Sighting:
         """Find the target.
@@ -229,6 +228,10 @@ class HvsNetwork(nn.Module):
             if shape.state_dim == POSITIONS_AND_VELOCITIES:
                 width += N_JOINTS
         hidden = shape.hidden
+        last = nn.Linear(hidden, N_JOINTS)
+        nn.init.zeros_(last.bias)
+        with torch.no_grad():
+            last.weight.mul_(0.1)
         self.head = nn.Sequential(
             nn.Linear(width, hidden),
             nn.SiLU(),
@@ -236,13 +239,8 @@ class HvsNetwork(nn.Module):
             nn.SiLU(),
             nn.Linear(hidden, hidden),
             nn.SiLU(),
-            nn.Linear(hidden, N_JOINTS),
+            last,
         )
-        last = self.head[-1]
-        assert isinstance(last, nn.Linear)
-        nn.init.zeros_(last.bias)
-        with torch.no_grad():
-            last.weight.mul_(0.1)
         # How far to trust the eye in hand over the eye to hand, from what both see.
         self.trust = nn.Linear(4 * n_cameras + 1, 1) if n_cameras > 1 and shape.state_dim else None
         self.step_gain = nn.Parameter(torch.full((N_JOINTS,), 0.5))

@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hvs_suite.cell.robot import JOINT_RANGE_RAD
+from hvs_suite.datasets.metadata import DatasetMetadata, write_metadata
 
 Columns = Mapping[str, npt.NDArray[Any]]
 
@@ -52,8 +53,7 @@ def write_dataset(
         "features": features,
     }
     (root / "meta" / "info.json").write_text(json.dumps(info))
-    ours = {"format": 1, "task": task, "task_version": 1, "split": split, "options": {}}
-    (root / "hvs.json").write_text(json.dumps(ours))
+    write_metadata(root, DatasetMetadata(task=task, task_version=1, split=split))
     for number, rows in enumerate(np.array_split(np.arange(len(episode_index)), n_files)):
         arrays: dict[str, Any] = {"episode_index": pa.array(episode_index[rows])}
         for key, values in columns.items():

@@ -1,0 +1,341 @@
+"""``servo``: classical hybrid visual servoing, as a practitioner would write it; no learning.
+
+It sees the observations alone and knows what the cell's manual says: the task's parameters, the
+robot's kinematics, both cameras' nominal calibration, and that the surface is the plane z = 0. It
+is not told what a scenario disturbs (pose of the eye-to-hand camera, encoder zeros, colours,
+latency), and reads none of it.
+
+A decision is:
+
+1. Find red patches in both pictures, keep those that can be the target, and turn their centres
+   into places on the surface through the camera models and the measured joints.
+2. Fuse them: the eye-to-hand camera serves the approach, the eye-in-hand camera the end. Near the
+   goal the disc's apparent size also gives the height, which encoder errors hide.
+3. Go where the target is believed to be, no lower than the eye-in-hand camera needs to see it for
+   certain. While nobody has seen it, hover over the nearest part of the surface that nobody has
+   looked at.
+4. Move there the fastest way within joint limits and clear of collisions: the expert's motion,
+   started from what is believed instead of from what is true.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Protocol, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from hvs_suite.cell.cameras import extrinsics, intrinsics, look_at
+from hvs_suite.cell.kinematics import kinematics, travel_time
+from hvs_suite.cell.robot import (
+    BASE_TO_SHOULDER_M,
+    ELBOW_TO_WRIST_M,
+    JOINT_RANGE_RAD,
+    JOINT_SPEED_RAD_S,
+    SHOULDER_TO_ELBOW_M,
+    WRIST_TO_FLANGE_M,
+)
+from hvs_suite.datasets.expert import Expert
+from hvs_suite.errors import PolicyError
+from hvs_suite.policies.disc_detection import find_blobs
+from hvs_suite.policies.target_estimate import Sight, Sighting, TargetEstimate
+from hvs_suite.policies.target_search import SPACING_M, TargetSearch
+from hvs_suite.rollout import Observation
+from hvs_suite.tasks.variants import AlignVariant, observation_names
+
+if TYPE_CHECKING:
+    from hvs_suite.cell.environment import Environment
+
+FloatArray = npt.NDArray[np.float64]
+
+_UP = np.array([0.0, 0.0, 1.0])
+_LOOK_HEIGHT_M = 0.30
+_MAX_HOVER_M = 0.40
+_VIEW_SHARE = 0.9
+"""Share of the eye-in-hand camera's half view that the target has to lie within."""
+_SIGMAS = 3.0
+_SETTLED_SIGMA_M = 0.003
+_MAX_MISSES = 6
+_MAX_LATENCY = 3
+_MOVED_SHARE = 0.1
+"""A first move of less than this share of the commanded one is still to come."""
+_REACH_MARGIN_M = 0.002
+_SHORTEST_REACH_M = 0.402
+"""Least distance of wrist and shoulder, A4 at its limit of 120 deg."""
+_LOOK_CHOICES = 12
+
+
+class Playground(Protocol):
+    """What the policy takes of an environment: the task's parameters, nothing else."""
+
+    @property
+    def variant(self) -> AlignVariant:
+        """The task's parameters."""
+
+
+class Belief:
+    """The arm's state as the policy can know it; answers for an environment to the expert.
+
+    Set points are remembered rather than seen: they move towards each command within the joint
+    speed limits. Whether commands act at once or a control step later shows in when the arm first
+    moves.
+
+    Attributes:
+        variant: The task's parameters.
+        joint_positions: Measured, (7,) rad.
+        joint_velocities: Measured, (7,) rad/s.
+    """
+
+    def __init__(self, variant: AlignVariant) -> None:
+        self.variant = variant
+        self.joint_positions = np.zeros(7)
+        self.joint_velocities = np.zeros(7)
+        self._goal = np.zeros(3)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last episode."""
+        self._start: FloatArray | None = None
+        self._commands: list[FloatArray] = []
+        self._latency = 0
+        self._has_moved = False
+
+    def measure(self, positions: FloatArray, velocities: FloatArray) -> None:
+        """Take in measured joint angles (7,) rad and speeds (7,) rad/s."""
+        self.joint_positions, self.joint_velocities = positions, velocities
+        if self._start is None:
+            self._start = positions
+        if self._commands and not self._has_moved:
+            # The commands so far, had they acted at once, would have moved the set point so far.
+            way = np.abs(self._tracked(self._commands) - self._start).max()
+            moved = np.abs(positions - self._start).max()
+            if moved > _MOVED_SHARE * way:
+                self._has_moved = True
+            else:
+                self._latency = min(len(self._commands), _MAX_LATENCY)
+
+    def aim(self, goal: FloatArray) -> None:
+        """Set the goal of the flange, (3,) m; it faces straight down."""
+        self._goal = goal
+
+    def command(self, action: npt.NDArray[np.float32]) -> None:
+        """Remember an action, (7,) in [-1, 1]."""
+        self._commands.append(action.astype(np.float64) * JOINT_RANGE_RAD)
+
+    @property
+    def setpoint(self) -> FloatArray:
+        """Set point that the controller tracks now, (7,) rad."""
+        return self._tracked(self._commands[: len(self._commands) - self._latency])
+
+    @property
+    def pending_setpoints(self) -> list[FloatArray]:
+        """Set points commanded that do not act yet, oldest first."""
+        return self._commands[len(self._commands) - self._latency :]
+
+    def privileged(self) -> dict[str, FloatArray]:
+        """The goal as believed: what the expert would read from the truth."""
+        return {"goal_position": self._goal, "goal_normal": _UP}
+
+    def commandable(self, q: npt.ArrayLike) -> npt.NDArray[np.float32]:
+        """The action (7,) float32 that sends the encoders to angles (7,) rad."""
+        return np.clip(np.asarray(q) / JOINT_RANGE_RAD, -1.0, 1.0).astype(np.float32)
+
+    def _tracked(self, commands: list[FloatArray]) -> FloatArray:
+        assert self._start is not None
+        limit = JOINT_SPEED_RAD_S * self.variant.control_period_s
+        set_point = self._start
+        for command in commands:
+            set_point = set_point + np.clip(command - set_point, -limit, limit)
+        return set_point
+
+
+class Servo:
+    """The policy; follows :class:`hvs_suite.rollout.Policy`.
+
+    Args:
+        variant: The task's parameters.
+
+    Raises:
+        PolicyError: The task needs what this method does not do.
+    """
+
+    def __init__(self, variant: AlignVariant) -> None:
+        _check(variant)
+        self._variant = variant
+        self._kinematics = kinematics()
+        self._belief = Belief(variant)
+        self._mover = Expert(cast("Environment", self._belief))
+        self._sight = Sight(variant.target_diameter_m, variant.ring_m)
+        self._search = TargetSearch(self._kinematics, variant.ring_m, variant.target_diameter_m)
+        names = observation_names(variant.observations)
+        self._has_eih, self._has_eth = "eih" in names, "eth" in names
+        self._eih_K = intrinsics(variant.eih_resolution, variant.eih_fov_deg)
+        self._eth_K = intrinsics(variant.eth_resolution, variant.eth_fov_deg)
+        self._eth_T = extrinsics(
+            np.array(variant.eth_position_m),
+            look_at(variant.eth_position_m, variant.eth_look_at_m),
+        )
+        self._half_view = float(np.tan(np.radians(variant.eih_fov_deg) / 2.0)) * _VIEW_SHARE
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last episode."""
+        self._belief.reset()
+        self._search.reset()
+        self._estimate = TargetEstimate()
+        self._hand: tuple[FloatArray, FloatArray] | None = None
+        self._look: FloatArray | None = None
+        self._misses = 0
+
+    def select_action(self, observation: Observation) -> npt.NDArray[np.float32]:
+        """Choose an action.
+
+        Args:
+            observation: ``eih`` and ``eth`` uint8 (H, W, 3), or one of them;
+                ``joint_positions`` (7,) rad; ``joint_velocities`` (7,) rad/s.
+
+        Returns:
+            Joint positions, (7,) float32 in [-1, 1].
+        """
+        q = np.asarray(observation["joint_positions"], np.float64)
+        self._belief.measure(q, np.asarray(observation["joint_velocities"], np.float64))
+        self._perceive(observation, q)
+        self._belief.aim(self._goal(q))
+        action = self._mover.label()
+        self._belief.command(action)
+        return action
+
+    # --- seeing ---------------------------------------------------------------------------------
+
+    def _perceive(self, observation: Observation, q: FloatArray) -> None:
+        """Take in both pictures."""
+        R, p = self._kinematics.flange_pose(q)
+        if self._hand is not None:
+            turn = float(np.arccos(np.clip(0.5 * (np.trace(self._hand[0].T @ R) - 1), -1, 1)))
+            self._estimate.move(float(np.linalg.norm(p - self._hand[1])), turn)
+        self._hand = (R, p)
+        # The optical frame of the eye in the hand is the flange frame.
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R.T, -R.T @ p
+        seen = self._sighting(observation["eih"], self._eih_K, T) if self._has_eih else None
+        if seen is not None:
+            self._misses = 0
+            self._estimate.see_eih(seen)
+            self._estimate.see_height(seen, float(-R[2, 2]))
+        elif self._has_eih:
+            self._notice_a_miss(T)
+        if self._has_eth and not self._estimate.in_hand_sigma_m < _SETTLED_SIGMA_M:
+            seen_eth = self._sighting(observation["eth"], self._eth_K, self._eth_T)
+            if seen_eth is not None:
+                self._estimate.see_eth(seen_eth)
+        if not self._estimate.is_known:
+            if self._has_eih:
+                self._search.rule_out(q, self._eih_K, T, self._variant.eih_resolution, own=True)
+            if self._has_eth:
+                side = self._variant.eth_resolution
+                self._search.rule_out(q, self._eth_K, self._eth_T, side, own=False)
+
+    def _sighting(
+        self, image: npt.NDArray[Any], K: FloatArray, T: FloatArray
+    ) -> Sighting | None:
+        """The first patch of a picture that can be the target."""
+        for blob in find_blobs(image):
+            sighting = self._sight.sighting(blob, K, T, self._estimate.surface_m)
+            if sighting is not None:
+                return sighting
+        return None
+
+    def _notice_a_miss(self, T: FloatArray) -> None:
+        """The eye in the hand sees no target: if it should, the estimate is wrong."""
+        if not self._estimate.is_known:
+            return
+        place, _ = self._estimate.place()
+        x, y, depth = T[:3, :3] @ [*place, 0.0] + T[:3, 3]
+        if depth <= 0.02 or max(abs(x), abs(y)) > self._half_view * depth:
+            return
+        self._misses += 1
+        if self._misses > _MAX_MISSES:
+            self._estimate = TargetEstimate()
+            self._search.reset()
+            self._look, self._misses = None, 0
+
+    # --- going ----------------------------------------------------------------------------------
+
+    def _goal(self, q: FloatArray) -> FloatArray:
+        """Where the flange shall go, (3,) m."""
+        if not self._estimate.is_known:
+            return self._look_out(q)
+        place, sigma = self._estimate.place()
+        standoff = self._variant.standoff_m
+        height = standoff
+        if self._has_eih:
+            needed = 0.5 * self._variant.target_diameter_m + _SIGMAS * sigma
+            height = max(standoff, needed / self._half_view) * (1.0 + 0.3 * self._misses)
+        goal = np.array([*place, min(height, _MAX_HOVER_M) + self._estimate.surface_m])
+        return goal if height == standoff else _within_reach(goal)
+
+    def _look_out(self, q: FloatArray) -> FloatArray:
+        """Where to hover to look at what nobody has looked at, (3,) m.
+
+        Of a few places, the one that shows most of the hidden surface for the time it takes; kept
+        until there is nothing left to see from it.
+        """
+        hidden = self._search.possible
+        radius = self._half_view * _LOOK_HEIGHT_M
+        if self._look is not None and _near(hidden, self._look, radius).any():
+            return self._look
+        best, self._look = -1.0, None
+        choices = hidden[np.unique(np.linspace(0, len(hidden) - 1, _LOOK_CHOICES).astype(int))]
+        for choice in choices:
+            covered = hidden[_near(hidden, choice, radius)]
+            goal = _within_reach(np.array([*covered[:, :2].mean(axis=0), _LOOK_HEIGHT_M]))
+            family = self._kinematics.goal_configurations_at_tool_angle(goal, _UP, q[6])
+            if not len(family):
+                continue
+            seconds = float(travel_time(q, family, acceleration_limits=True).min())
+            worth = len(covered) / (seconds + 0.3)
+            if worth > best:
+                best, self._look = worth, goal
+        if self._look is None:
+            self._look = _within_reach(np.array([*choices[0, :2], _LOOK_HEIGHT_M]))
+        return self._look
+
+
+def _near(points: FloatArray, place: FloatArray, radius: float) -> npt.NDArray[np.bool_]:
+    """Which points (n, 3) lie within a radius (m) of a place, seen from above."""
+    inner = max(radius - SPACING_M, SPACING_M)
+    return np.asarray(np.hypot(*(points[:, :2] - place[:2]).T) < inner)
+
+
+def _within_reach(goal: FloatArray) -> FloatArray:
+    """The nearest place at the same height over which the arm can face down, (3,) m."""
+    rise = goal[2] + WRIST_TO_FLANGE_M - BASE_TO_SHOULDER_M
+    longest = SHOULDER_TO_ELBOW_M + ELBOW_TO_WRIST_M - _REACH_MARGIN_M
+    outer = np.sqrt(max(longest**2 - rise**2, 0.0))
+    inner = np.sqrt(max(_SHORTEST_REACH_M**2 - rise**2, 0.0))
+    radius = max(float(np.hypot(goal[0], goal[1])), 1e-6)
+    scale = np.clip(radius, inner, outer) / radius
+    return np.array([goal[0] * scale, goal[1] * scale, goal[2]])
+
+
+def _check(variant: AlignVariant) -> None:
+    """Refuse what the method does not do, in a sentence."""
+    names = observation_names(variant.observations)
+    if not {"eih", "eth"} & set(names) or not {"joint_positions", "joint_velocities"} <= set(names):
+        raise PolicyError(
+            "servo needs a camera, joint_positions and joint_velocities; use the preset 'vision'"
+        )
+    if variant.normalise_observation or variant.action_mode != "joint_position":
+        raise PolicyError("servo takes raw observations and commands joint positions")
+    if any(
+        name in names and channels != 3
+        for name, channels in (("eih", variant.eih_channels), ("eth", variant.eth_channels))
+    ):
+        raise PolicyError("servo tells the target by its colour; use cameras with 3 channels")
+    if variant.surface != "flat" or variant.marker != "disc":
+        raise PolicyError("servo knows discs on flat surfaces alone")
+
+
+def make_servo(env: Playground) -> Servo:
+    """The policy for an environment, of which it takes the parameters alone."""
+    return Servo(env.variant)
