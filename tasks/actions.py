@@ -58,12 +58,13 @@ def check_action(action: Any, mode: ActionMode, *, clip: bool) -> tuple[FloatArr
         raise ActionError(f"an action is {size} numbers in [-1, 1], not {action!r}") from error
     if values.shape != (size,):
         raise ActionError(f"an action of mode {mode} has shape ({size},), not {values.shape}")
-    if not np.isfinite(values).all():
-        bad = int(np.flatnonzero(~np.isfinite(values))[0])
-        raise ActionError(f"action[{bad}] is {values[bad]}; actions are finite numbers in [-1, 1]")
+    # NaN fails this comparison too, so that the common case costs one.
     largest = float(np.abs(values).max())
     if largest <= 1.0:
         return values, False
+    if not np.isfinite(values).all():
+        bad = int(np.flatnonzero(~np.isfinite(values))[0])
+        raise ActionError(f"action[{bad}] is {values[bad]}; actions are finite numbers in [-1, 1]")
     if not clip:
         raise ActionError(
             f"an action value of {largest:.6g} lies outside [-1, 1]; clip it, or use the "
@@ -103,4 +104,4 @@ def set_point(
         speed = J.T @ np.linalg.solve(J @ J.T + _DAMPING**2 * np.eye(6), twist)
         speed /= max(1.0, float((np.abs(speed) / JOINT_SPEED_RAD_S).max()))
         target = commanded + speed * period_s
-    return np.clip(target, -JOINT_RANGE_RAD, JOINT_RANGE_RAD)
+    return np.minimum(np.maximum(target, -JOINT_RANGE_RAD), JOINT_RANGE_RAD)
