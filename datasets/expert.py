@@ -33,6 +33,8 @@ FloatArray = npt.NDArray[np.float64]
 
 CLEARANCE_M = 0.010
 """Distance that a motion keeps from the surface and between links (m)."""
+ESCAPE_HEIGHT_M = 0.15
+"""Where no way to the goal is clear, go above it first (m)."""
 N_SWIVEL = 360
 """Elbow places in the ranked family; one degree apart costs under 10 ms of travel time."""
 PROJECTION_RANGE_M = 0.15
@@ -47,6 +49,7 @@ the fewest steps. More overshoots the goal, less arrives late."""
 _LAG_S: FloatArray = robot.DAMPING_NM_S_RAD / robot.STIFFNESS_NM_RAD
 """Each joint trails a moving set point by kv / kp (s)."""
 _MAX_PATHS = 24
+_MAX_ESCAPES = 4
 _MAX_FLANGE_SPEED_M_S = 2.5
 _PATH_STEP_S = 0.02
 _DISTINCT_RAD = 0.2
@@ -169,22 +172,58 @@ class Expert:
         if len(candidates) == 0:
             return q  # Out of reach: stand still.
         required = min(CLEARANCE_M, self._kinematics.clearance(q) - 1e-3)
-        rejected: list[FloatArray] = []
-        best: tuple[float, FloatArray] = (-np.inf, q)
+        motion = self._first_clear(q, velocity, candidates, required)
+        if motion is None:
+            motion = self._escape(q, velocity, position, normal, required)
+        # The arm trails its set point, so the set point leads.
+        ahead = min(self._period_s + LEAD_S, motion.duration)
+        return np.asarray(motion.at_time(ahead)[0])
+
+    def _first_clear(
+        self, q: FloatArray, velocity: FloatArray, candidates: FloatArray, required: float
+    ) -> ruckig.Trajectory | None:
+        """The motion to the first candidate that keeps clear; skips what is near a blocked one."""
+        blocked: list[FloatArray] = []
         for goal in candidates:
-            if any(np.abs(goal - other).max() < _DISTINCT_RAD for other in rejected):
+            if any(np.abs(goal - other).max() < _DISTINCT_RAD for other in blocked):
                 continue
             motion = self._motion(q, velocity, goal)
-            least = self._least_clearance(motion, required)
-            if least > best[0]:
-                ahead = min(self._period_s + LEAD_S, motion.duration)
-                best = (least, np.asarray(motion.at_time(ahead)[0]))
+            if self._least_clearance(motion, required) >= required:
+                return motion
+            blocked.append(goal)
+            if len(blocked) >= _MAX_PATHS:
+                break
+        return None
+
+    def _escape(
+        self,
+        q: FloatArray,
+        velocity: FloatArray,
+        position: FloatArray,
+        normal: FloatArray,
+        required: float,
+    ) -> ruckig.Trajectory:
+        """A motion away from obstacles where all ways to the goal are blocked or too fast.
+
+        To a place above the goal, towards the upright posture, or braking, whichever keeps clear
+        first or else clearest; each joint as fast as it can.
+        """
+        above = self._kinematics.goal_configurations_at_tool_angle(
+            position + ESCAPE_HEIGHT_M * normal, normal, tool_angle=q[6], n_swivel=24
+        )
+        rest = q + velocity * np.abs(velocity) / (2.0 * robot.JOINT_ACCELERATION_RAD_S2)
+        rest = np.clip(rest, -robot.JOINT_RANGE_RAD, robot.JOINT_RANGE_RAD)
+        upright = np.append(np.zeros(6), rest[6])
+        nearest = above[np.argsort(np.abs(above - rest).max(axis=1))[:_MAX_ESCAPES]]
+        best, clearest = -np.inf, self._motion(q, velocity, rest, together=False)
+        for target in (*nearest, upright, 0.5 * (rest + upright), rest):
+            motion = self._motion(q, velocity, target, together=False)
+            least = self._least_clearance(motion, -np.inf)
             if least >= required:
-                break
-            rejected.append(goal)
-            if len(rejected) >= _MAX_PATHS:
-                break
-        return best[1]
+                return motion
+            if least > best:
+                best, clearest = least, motion
+        return clearest
 
     def _ranked_goals(
         self, q: FloatArray, velocity: FloatArray, position: FloatArray, normal: FloatArray
@@ -238,8 +277,10 @@ class Expert:
             return None
         return np.asarray(goal)
 
-    def _motion(self, q: FloatArray, velocity: FloatArray, goal: FloatArray) -> ruckig.Trajectory:
-        """The time-optimal motion to rest at a goal, all joints arriving together."""
+    def _motion(
+        self, q: FloatArray, velocity: FloatArray, goal: FloatArray, *, together: bool = True
+    ) -> ruckig.Trajectory:
+        """The time-optimal motion to rest at a goal, the joints arriving together or each alone."""
         speed = robot.JOINT_SPEED_RAD_S
         # Ruckig's root finding stumbles over distances at the limit of double precision.
         start = np.where(np.abs(q - goal) < 1e-9, goal, q)
@@ -247,6 +288,9 @@ class Expert:
         self._input.current_position = list(start)
         self._input.current_velocity = list(moving)
         self._input.target_position = list(goal)
+        self._input.synchronization = (
+            ruckig.Synchronization.Time if together else ruckig.Synchronization.No
+        )
         trajectory = ruckig.Trajectory(7)
         self._ruckig.calculate(self._input, trajectory)
         return trajectory
@@ -264,7 +308,7 @@ class Expert:
             least = min(least, clearance)
             if least < required or t >= motion.duration:
                 return float(least)
-            t += max(_PATH_STEP_S, (clearance - required) / _MAX_FLANGE_SPEED_M_S)
+            t += max(_PATH_STEP_S, (clearance - CLEARANCE_M) / _MAX_FLANGE_SPEED_M_S)
 
 
 def make_expert(env: Environment) -> Expert:

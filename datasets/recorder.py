@@ -95,7 +95,7 @@ def record(
     """
     variant = with_options(find(task), dict(options or {}))
     features = dataset_features(variant)
-    _check_numbers(episodes, split, noise, block)
+    _check_numbers(episodes, split, noise, workers, block)
     root = Path(out)
     metadata = DatasetMetadata(
         task=task,
@@ -201,7 +201,7 @@ class _Tracker:
         )
 
 
-def _check_numbers(episodes: int, split: str, noise: float, block: int) -> None:
+def _check_numbers(episodes: int, split: str, noise: float, workers: int, block: int) -> None:
     """Refuses counts and noise that make no sense."""
     if episodes < 1:
         raise OptionError(f"episodes is {episodes}; record at least 1")
@@ -214,6 +214,8 @@ def _check_numbers(episodes: int, split: str, noise: float, block: int) -> None:
         )
     if not math.isfinite(noise) or noise < 0.0:
         raise OptionError(f"noise is {noise}; use a standard deviation in rad from 0 up")
+    if workers < 1:
+        raise OptionError(f"workers is {workers}; use at least 1 process")
     if block < 1:
         raise OptionError(f"block is {block}; publish every 1 or more episodes")
 

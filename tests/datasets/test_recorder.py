@@ -1,0 +1,237 @@
+"""Recording: LeRobot reads what was recorded, and nothing but the scenarios shapes it."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+import hvs_suite
+from hvs_suite.datasets.metadata import read_metadata
+from hvs_suite.datasets.recorder import record
+from hvs_suite.datasets.writer import STAGE
+from hvs_suite.errors import DatasetError, OptionError, OutputError, ScenarioError
+
+TASK = "align-fixed"
+N = 5
+# Importing LeRobot's dataset package takes some 20 s.
+pytestmark = pytest.mark.timeout(300)
+
+
+def columns(root):
+    """All frames of a dataset by column, images as PNG bytes, in order of their index."""
+    tables = [pq.read_table(path) for path in sorted(Path(root, "data").glob("*/*.parquet"))]
+    rows = sorted((row for table in tables for row in table.to_pylist()), key=lambda r: r["index"])
+    return {name: [row[name] for row in rows] for name in rows[0]}
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    root = tmp_path_factory.mktemp("recorded") / "clean"
+    record(TASK, N, "train", root, block=2)
+    return root
+
+
+def test_plain_lerobot_reads_the_dataset_offline(dataset, monkeypatch):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    loaded = LeRobotDataset("local/any", root=dataset)
+    assert loaded.num_episodes == N
+    assert loaded.meta.robot_type == "kuka_lbr_iiwa"
+    assert loaded.fps == 10
+    frame = loaded[0]
+    assert frame["observation.images.eih"].shape == (3, 112, 112)
+    assert frame["observation.images.eth"].shape == (3, 112, 112)
+    assert frame["observation.state"].shape == (14,)
+    assert frame["action"].shape == (7,)
+    assert frame["task"] == hvs_suite.TASKS[TASK].instruction
+    assert loaded.meta.features["observation.state"]["names"][:8] == [
+        *(f"A{i}.pos" for i in range(1, 8)),
+        "A1.vel",
+    ]
+    assert len(loaded) == loaded.meta.total_frames
+    assert loaded.meta.stats["action"]["mean"].shape == (7,)
+
+
+def test_only_observations_reach_policies(dataset):
+    info = json.loads((dataset / "meta" / "info.json").read_text())
+    inputs = {name for name in info["features"] if name.startswith("observation")}
+    assert inputs == {"observation.images.eih", "observation.images.eth", "observation.state"}
+
+
+def test_episode_i_is_scenario_i_and_ends_in_success(dataset):
+    frames = columns(dataset)
+    assert frames["privileged.scenario"] == frames["episode_index"]
+    last = np.flatnonzero(frames["next.done"])
+    assert len(last) == N
+    assert all(frames["next.success"][i] for i in last)
+    assert frames["index"] == list(range(len(frames["index"])))
+
+
+def test_playing_the_executed_actions_again_reproduces_the_states(dataset):
+    frames = columns(dataset)
+    with hvs_suite.load(TASK, observations="vision") as env:
+        for episode in range(2):
+            rows = [i for i, e in enumerate(frames["episode_index"]) if e == episode]
+            time_step = env.reset(scenario=episode)
+            for i in rows:
+                seen = time_step.observation
+                state = np.concatenate([seen["joint_positions"], seen["joint_velocities"]])
+                np.testing.assert_array_equal(
+                    np.float32(frames["observation.state"][i]), np.float32(state)
+                )
+                action = np.float32(frames["privileged.action_executed"][i])
+                time_step = env.step(action)
+            assert env.info["is_success"]
+
+
+def test_images_are_lossless(dataset):
+    import io
+
+    from PIL import Image
+
+    stored = columns(dataset)["observation.images.eth"][0]["bytes"]
+    with hvs_suite.load(TASK) as env:
+        seen = env.reset(scenario=0).observation["eth"]
+    difference = np.array(Image.open(io.BytesIO(stored))).astype(int) - seen
+    # Another process may round a pixel otherwise; compression would change thousands.
+    assert np.count_nonzero(difference) <= 5
+
+
+def test_two_workers_record_what_one_does(dataset, tmp_path):
+    record(TASK, N, "train", tmp_path / "two", workers=2, block=3)
+    one, two = columns(dataset), columns(tmp_path / "two")
+    assert one.keys() == two.keys()
+    for name in one.keys() - {"observation.images.eih", "observation.images.eth"}:
+        assert one[name] == two[name], name
+
+
+def test_noise_changes_what_is_done_and_not_what_is_taught(tmp_path):
+    record("align-easy", 2, "train", tmp_path / "noisy", noise=0.05)
+    frames = columns(tmp_path / "noisy")
+    taught, done = np.array(frames["action"]), np.array(frames["privileged.action_executed"])
+    assert np.abs(taught - done).max() > 1e-3
+    with hvs_suite.load("align-easy", observations="state") as env:
+        from hvs_suite.datasets.expert import make_expert
+
+        expert = make_expert(env)
+        env.reset(scenario=0)
+        for i in range(3):
+            np.testing.assert_allclose(expert.label(), taught[i], atol=1e-6)
+            env.step(np.float32(done[i]))
+    assert read_metadata(tmp_path / "noisy").noise == 0.05
+
+
+def test_failures_are_kept_and_marked(tmp_path):
+    progress = record(TASK, 2, "train", tmp_path / "short", options={"time_limit_steps": 3})
+    frames = columns(tmp_path / "short")
+    assert (progress.episodes, progress.successes) == (2, 0)
+    assert len(frames["next.done"]) == 6
+    assert not any(frames["next.success"])
+    assert read_metadata(tmp_path / "short").options == {"time_limit_steps": 3}
+
+
+def test_resuming_after_a_kill_gives_the_same_dataset(dataset, tmp_path):
+    root = tmp_path / "killed"
+    script = (
+        "import os, signal\n"
+        "from hvs_suite.datasets.recorder import record\n"
+        f"def stop(p):\n    if p.episodes == 3: os.kill(os.getpid(), signal.SIGKILL)\n"
+        f"record({TASK!r}, {N}, 'train', {str(root)!r}, block=2, progress=stop)\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", script], check=False, env=dict(os.environ))
+    assert ended.returncode == -signal.SIGKILL
+    # Three were written, the third one's block was open.
+    assert (root / STAGE).exists()
+    assert set(columns(root)["episode_index"]) == {0, 1}
+    progress = record(TASK, N, "train", root, resume=True, block=2)
+    assert (progress.episodes, progress.successes) == (N, N)
+    assert not (root / STAGE).exists()
+    before, after = columns(dataset), columns(root)
+    for name in before.keys() - {"observation.images.eih", "observation.images.eth"}:
+        assert before[name] == after[name], name
+
+
+def test_files_of_a_half_published_block_are_dropped_on_resume(dataset, tmp_path):
+    root = tmp_path / "half"
+    shutil.copytree(dataset, root)
+    info = json.loads((root / "meta" / "info.json").read_text())
+    first = pq.read_table(root / "data" / "chunk-000" / "file-000.parquet")
+    info["total_episodes"], info["total_frames"] = 2, first.num_rows
+    (root / "meta" / "info.json").write_text(json.dumps(info))
+    record(TASK, N, "train", root, resume=True, block=2)
+    assert columns(root)["index"] == columns(dataset)["index"]
+    assert columns(root)["action"] == columns(dataset)["action"]
+
+
+def test_a_complete_dataset_is_left_alone_by_resume(dataset):
+    before = columns(dataset)["action"]
+    progress = record(TASK, N, "train", dataset, resume=True)
+    assert progress.episodes == N
+    assert columns(dataset)["action"] == before
+
+
+def test_progress_is_told_after_each_episode(tmp_path):
+    told = []
+    record(TASK, 3, "train", tmp_path / "told", progress=told.append)
+    assert [p.episodes for p in told] == [1, 2, 3]
+    assert told[-1].successes == 3
+    assert told[-1].episodes_per_s > 0
+
+
+def test_another_recording_is_not_resumed(dataset):
+    with pytest.raises(DatasetError, match="another split"):
+        record(TASK, N, "test", dataset, resume=True)
+
+
+def test_a_folder_that_is_not_empty_is_not_overwritten(dataset, tmp_path):
+    with pytest.raises(OutputError, match="--resume"):
+        record(TASK, N, "train", dataset)
+    (tmp_path / "photo.png").touch()
+    with pytest.raises(OutputError, match="no recording"):
+        record(TASK, N, "train", tmp_path, resume=True)
+
+
+def test_a_folder_that_cannot_be_made_is_one_clear_line(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="choose another"):
+        record(TASK, 1, "train", tmp_path / "file" / "dataset")
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({"episodes": 0}, OptionError),
+        ({"episodes": 1001, "split": "test"}, ScenarioError),
+        ({"split": " "}, ScenarioError),
+        ({"noise": -0.1}, OptionError),
+        ({"noise": float("nan")}, OptionError),
+        ({"workers": 0}, OptionError),
+        ({"options": {"eih_channels": 1}}, OptionError),
+        ({"options": {"action_mode": "joint_delta"}}, OptionError),
+        ({"options": {"no_such_option": 1}}, OptionError),
+    ],
+)
+def test_nonsense_is_refused_before_anything_is_written(change, error, tmp_path):
+    arguments = {"task": TASK, "episodes": 1, "split": "train", "out": tmp_path / "new", **change}
+    with pytest.raises(error):
+        record(**arguments)
+    assert not (tmp_path / "new").exists()
+
+
+def test_metadata_of_anything_else_is_refused(tmp_path):
+    with pytest.raises(DatasetError, match=r"hvs\.json"):
+        read_metadata(tmp_path)
+    (tmp_path / "hvs.json").write_text("{")
+    with pytest.raises(DatasetError, match="damaged"):
+        read_metadata(tmp_path)
+    (tmp_path / "hvs.json").write_text('{"format": 99}')
+    with pytest.raises(DatasetError, match="format"):
+        read_metadata(tmp_path)
