@@ -3,9 +3,12 @@ r"""The named tasks as a LeRobot environment: ``--env.type=hvs``.
     lerobot-eval --env.discover_packages_path=hvs_suite.lerobot_env --env.type=hvs \
         --env.task=align-thesis --policy.path=DIR
 
-Importing this package registers the type. It imports LeRobot, which takes some seconds.
+Importing this package registers the type, and that of the suite's own policy with it: LeRobot does
+not accept ``--policy.discover_packages_path`` beside ``--policy.path``. It imports LeRobot, which
+takes some seconds.
 """
 
+import hvs_suite.policies.hvs.configuration_hvs  # noqa: F401 - registers the policy's type
 from hvs_suite.lerobot_env.configuration import HvsEnvConfig
 
 __all__ = ["HvsEnvConfig"]

@@ -26,6 +26,9 @@ STATE = "observation.state"
 N_JOINTS = 7
 FEATURE_SIZE = 28
 """Cells along the side of a feature map, about."""
+OUTLINE_SIZE = 7
+"""Cells along the side of the coarse picture of a disc's outline."""
+SIGHTING_FEATURES = 5
 DELTA_SCALE_RAD = 0.005
 """Joint steps are regressed as asinh(step / this): linear below, logarithmic above."""
 OFFSET_SCALE_M = 0.005
@@ -79,15 +82,19 @@ class Sighting:
         uv: Centre of the target in [-1, 1], (B, 2).
         log_diameter: Logarithm of the apparent diameter in image widths, (B, 1).
         visible_logit: Logit that the target is in view, (B, 1).
+        trust_logit: How far to trust the centre against the other camera's, (B, 1); learned from
+            where the target turns out to be, also where a mere rim of it is in view.
     """
 
     uv: Tensor
     log_diameter: Tensor
     visible_logit: Tensor
+    trust_logit: Tensor
 
     def features(self) -> Tensor:
-        """Everything the head reads of it, (B, 4)."""
-        return torch.cat([self.uv, self.log_diameter, torch.tanh(self.visible_logit / 4.0)], dim=1)
+        """What the head reads of it, (B, 5)."""
+        logits = torch.cat([self.visible_logit, self.trust_logit], dim=1)
+        return torch.cat([self.uv, self.log_diameter, torch.tanh(logits / 4.0)], dim=1)
 
 
 def strides(side: int) -> tuple[int, ...]:
@@ -137,15 +144,18 @@ class Eye(nn.Module):
             layers += [nn.Conv2d(width, channels, 3, 1, 1), nn.ReLU(inplace=True)]
             width = channels
         self.features = nn.Sequential(*layers)
-        self.score = nn.Conv2d(channels, 1, 1)
+        # One channel for the centre, one for the outline.
+        self.score = nn.Conv2d(channels, 2, 1)
         # A mean over cells cannot reach the border, and strides shift it by a fraction of a cell.
         self.uv_scale = nn.Parameter(torch.full((2,), 1.05))
         self.uv_shift = nn.Parameter(torch.zeros(2))
-        last = nn.Linear(64, 2)
+        last = nn.Linear(96, 5)
         nn.init.zeros_(last.weight)
         with torch.no_grad():
-            last.bias.copy_(torch.tensor([math.log(0.15), 0.0]))
-        self.size_and_visibility = nn.Sequential(nn.Linear(2 * channels + 5, 64), nn.SiLU(), last)
+            last.bias.copy_(torch.tensor([0.0, 0.0, math.log(0.15), 0.0, 0.0]))
+        self.judge = nn.Sequential(
+            nn.Linear(2 * channels + OUTLINE_SIZE**2 + 4, 96), nn.SiLU(), last
+        )
 
     def forward(self, images: Tensor) -> Sighting:
         """Find the target.
@@ -161,27 +171,20 @@ class Eye(nn.Module):
         with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=half):
             maps = self.features(x)
         maps = maps.float()
-        scores = self.score(maps)[:, 0]  # (B, h, w)
+        scores, outline = self.score(maps).unbind(dim=1)  # (B, h, w) each
         weights = torch.softmax(scores.flatten(1), dim=1)
         grid = weights.view_as(scores)
         u, u_spread = _moments(grid.sum(dim=1))
         v, v_spread = _moments(grid.sum(dim=2))
-        filled = torch.sigmoid(scores).mean(dim=(1, 2), keepdim=True)[:, :, 0].clamp(min=1e-6)
         uv = torch.cat([u, v], dim=1)
         flat = maps.flatten(2)
-        pooled = torch.cat(
-            [
-                (flat * weights[:, None]).sum(dim=2),
-                flat.amax(dim=2),
-                u_spread,
-                v_spread,
-                filled.sqrt(),
-                uv.abs(),
-            ],
-            dim=1,
-        )
-        size, visible = self.size_and_visibility(pooled).split(1, dim=1)
-        return Sighting(uv * self.uv_scale + self.uv_shift, size, visible)
+        filled = F.adaptive_avg_pool2d(torch.sigmoid(outline)[:, None], OUTLINE_SIZE)
+        pooled = [(flat * weights[:, None]).sum(dim=2), flat.amax(dim=2), filled.flatten(1)]
+        judged = self.judge(torch.cat([*pooled, uv, u_spread, v_spread], dim=1))
+        # A disc that is cut by the image's border has its centre elsewhere than what is in view.
+        correction, size, visible, trust = judged.split((2, 1, 1, 1), dim=1)
+        uv = uv * self.uv_scale + self.uv_shift + correction
+        return Sighting(uv, size, visible, trust)
 
 
 def _moments(marginal: Tensor) -> tuple[Tensor, Tensor]:
@@ -222,7 +225,7 @@ class HvsNetwork(nn.Module):
         self.register_buffer("plane_height", torch.tensor(0.0))
         self.register_buffer("standoff", torch.tensor(0.05))
         n_cameras = len(shape.cameras)
-        width = 4 * n_cameras
+        width = SIGHTING_FEATURES * n_cameras
         if shape.state_dim:
             width += 3 * N_JOINTS + 12 + 7 * (n_cameras + (n_cameras > 1)) + N_JOINTS
             if shape.state_dim == POSITIONS_AND_VELOCITIES:
@@ -241,8 +244,6 @@ class HvsNetwork(nn.Module):
             nn.SiLU(),
             last,
         )
-        # How far to trust the eye in hand over the eye to hand, from what both see.
-        self.trust = nn.Linear(4 * n_cameras + 1, 1) if n_cameras > 1 and shape.state_dim else None
         self.step_gain = nn.Parameter(torch.full((N_JOINTS,), 0.5))
 
     def set_calibration(self, calibration: Calibration) -> None:
@@ -316,20 +317,21 @@ class HvsNetwork(nn.Module):
             The best estimate (B, 3) m, and every estimate with its weight, (B, 4) each.
         """
         estimates = []
+        valid = motion.position.new_ones(len(motion.position), 1)
         for name, sighting in sightings.items():
             confidence = torch.sigmoid(sighting.visible_logit)
             if name == "eih":
                 point = geometry.seen_from_hand(motion, sighting.uv, self.rays, self.plane_height)
-                estimates.append(torch.cat([point[:, :3], point[:, 3:] * confidence], dim=1))
+                valid = point[:, 3:]
+                estimates.append(torch.cat([point[:, :3], valid * confidence], dim=1))
             else:
                 point = geometry.seen_from_afar(sighting.uv, self.homography, self.plane_height)
                 estimates.append(torch.cat([point, confidence], dim=1))
-        if self.trust is None:
+        if len(estimates) == 1:
             return estimates[0][:, :3], estimates
-        seen = [s.features() for s in sightings.values()]
-        near = estimates[0][:, 3:]  # the eye in hand comes first
-        logit = self.trust(torch.cat([*seen, near], dim=1)) + 8.0 * (near - 0.5)
-        share = torch.sigmoid(logit)
+        hand, afar = sightings.values()  # the eye in hand comes first
+        logit = hand.trust_logit - afar.trust_logit
+        share = torch.sigmoid(torch.where(valid > 0, logit, torch.full_like(logit, -20.0)))
         best = share * estimates[0][:, :3] + (1.0 - share) * estimates[1][:, :3]
         return best, [*estimates, torch.cat([best, share], dim=1)]
 
