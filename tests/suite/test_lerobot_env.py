@@ -1,0 +1,179 @@
+"""LeRobot's environment contract, and `lerobot-eval` run for real."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import hvs_suite
+from hvs_suite.errors import OptionError, UnknownTaskError
+
+pytest.importorskip("lerobot")
+# Importing LeRobot takes seconds, and half a minute on a busy machine.
+pytestmark = pytest.mark.timeout(300)
+
+
+@pytest.fixture(scope="module")
+def package():
+    import hvs_suite.lerobot_env
+
+    return hvs_suite.lerobot_env
+
+
+@pytest.fixture(scope="module")
+def vector(package):
+    from lerobot.envs import make_env
+
+    suites = make_env(package.HvsEnvConfig(task="align-easy"), n_envs=2)
+    yield suites["hvs"][0]
+    suites["hvs"][0].close()
+
+
+def test_importing_the_package_registers_the_type(package):
+    from lerobot.envs import make_env_config
+
+    config = make_env_config("hvs", task="align-thesis")
+    assert isinstance(config, package.HvsEnvConfig)
+    assert (config.type, config.fps, config.split) == ("hvs", 10, "test")
+
+
+@pytest.mark.parametrize("task", sorted(hvs_suite.TASKS))
+def test_features_follow_from_the_task(package, task):
+    from lerobot.envs import env_to_policy_features
+
+    variant = hvs_suite.TASKS[task]
+    features = env_to_policy_features(package.HvsEnvConfig(task=task))
+    side = variant.eth_resolution
+    assert features["observation.images.eth"].shape == (3, side, side)
+    assert features["observation.state"].shape == (14,)
+    assert features["action"].shape == (7,)
+
+
+def test_observations_have_pixels_and_agent_pos(vector):
+    from lerobot.envs import preprocess_observation
+
+    observation, _ = vector.reset(seed=[1000, 1001])
+    assert observation["pixels"]["eih"].shape == (2, 112, 112, 3)
+    assert observation["pixels"]["eth"].dtype == np.uint8
+    assert observation["agent_pos"].shape == (2, 14)
+    batch = preprocess_observation(observation)
+    assert set(batch) == {
+        "observation.images.eih",
+        "observation.images.eth",
+        "observation.state",
+    }
+
+
+def test_seeds_from_1000_up_are_the_first_test_scenarios(vector):
+    _, info = vector.reset(seed=[1000, 1001], options={"lerobot_new_rollout": True})
+    assert info["scenario"].tolist() == [0, 1]
+    assert info["is_success"].tolist() == [False, False]
+
+
+def test_attributes_that_lerobot_asks_for_are_there(vector):
+    assert vector.call("_max_episode_steps") == (20, 20)
+    assert vector.call("task") == ("align-easy", "align-easy")
+    assert vector.call("task_description")[0] == hvs_suite.TASKS["align-easy"].instruction
+    assert vector.metadata["render_fps"] == 10
+    vector.reset(seed=0)
+    assert vector.envs[0].render().shape == (480, 480, 3)
+    assert vector.single_action_space.shape == (7,)
+
+
+def test_every_step_says_whether_it_succeeded(vector):
+    vector.reset(seed=0)
+    for _ in range(3):
+        info = vector.step(np.zeros((2, 7), np.float32))[4]
+        assert info["is_success"].tolist() == [False, False]
+
+
+def test_async_environments_work_in_processes_without_lerobot(package):
+    vector = package.HvsEnvConfig(task="align-easy").create_envs(2, use_async_envs=True)["hvs"][0]
+    try:
+        _, info = vector.reset(seed=[1000, 1001])
+        assert info["scenario"].tolist() == [0, 1]
+        vector.step(np.zeros((2, 7), np.float32))
+    finally:
+        vector.close()
+
+
+def test_split_length_and_options_reach_the_task(package):
+    config = package.HvsEnvConfig(
+        task="align-easy", split="train", episode_length=4, options={"eth_resolution": 64}
+    )
+    assert config.features["observation.images.eth"].shape == (64, 64, 3)
+    vector = config.create_envs(1)["hvs"][0]
+    _, info = vector.reset(seed=[3])
+    assert info["split"][0] == "train"
+    assert vector.call("_max_episode_steps") == (4,)
+    vector.close()
+
+
+def test_what_lerobot_cannot_take_is_refused(package):
+    with pytest.raises(UnknownTaskError, match="align-easy"):
+        package.HvsEnvConfig(task="align-eas")
+    with pytest.raises(OptionError, match="eih"):
+        package.HvsEnvConfig(options={"eih_channels": 1})
+    with pytest.raises(OptionError):
+        package.HvsEnvConfig(options={"normalise_observation": True})
+
+
+@pytest.mark.timeout(600)
+def test_lerobot_eval_scores_a_policy_on_a_named_task(package, tmp_path):
+    import torch
+    from lerobot.envs import env_to_policy_features
+    from lerobot.policies.act.configuration_act import ACTConfig
+    from lerobot.policies.act.modeling_act import ACTPolicy
+    from lerobot.policies.factory import make_pre_post_processors
+
+    features = env_to_policy_features(
+        package.HvsEnvConfig(options={"eih_resolution": 48, "eth_resolution": 48})
+    )
+    config = ACTConfig(
+        input_features={k: f for k, f in features.items() if k != "action"},
+        output_features={"action": features["action"]},
+        pretrained_backbone_weights=None,
+        device="cpu",
+        push_to_hub=False,
+        dim_model=32,
+        n_heads=2,
+        dim_feedforward=32,
+        n_encoder_layers=1,
+        n_decoder_layers=1,
+        chunk_size=4,
+        n_action_steps=4,
+        use_vae=False,
+    )
+    folder = tmp_path / "act"
+    ACTPolicy(config).save_pretrained(folder)
+    stats = {
+        name: {
+            "mean": torch.zeros(3, 1, 1) if "images" in name else torch.zeros(f.shape),
+            "std": torch.ones(3, 1, 1) if "images" in name else torch.ones(f.shape),
+        }
+        for name, f in features.items()
+    }
+    for processor in make_pre_post_processors(config, dataset_stats=stats):
+        processor.save_pretrained(folder)
+    command = [
+        *(sys.executable, "-m", "lerobot.scripts.lerobot_eval"),
+        "--env.discover_packages_path=hvs_suite.lerobot_env",
+        "--env.type=hvs",
+        "--env.task=align-easy",
+        "--env.episode_length=3",
+        '--env.options={"eih_resolution": 48, "eth_resolution": 48}',
+        f"--policy.path={folder}",
+        "--policy.device=cpu",
+        "--eval.batch_size=2",
+        "--eval.use_async_envs=false",
+        "--eval.n_episodes=2",
+        f"--output_dir={tmp_path / 'out'}",
+    ]
+    ended = subprocess.run(command, check=False, capture_output=True, text=True, cwd=tmp_path)
+    assert ended.returncode == 0, ended.stderr[-3000:]
+    result = json.loads((tmp_path / "out" / "eval_info.json").read_text())
+    assert result["overall"]["n_episodes"] == 2
+    assert result["overall"]["pc_success"] == 0.0
+    assert len(result["overall"]["video_paths"]) == 2
