@@ -53,6 +53,8 @@ _MAX_ESCAPES = 4
 _MAX_FLANGE_SPEED_M_S = 2.5
 _PATH_STEP_S = 0.02
 _DISTINCT_RAD = 0.2
+# Ruckig fails on some targets that braking reaches exactly; one beside them will do.
+_NUDGES_RAD = (0.0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3)
 _ITERATIONS = 8
 
 
@@ -110,6 +112,7 @@ class Expert:
         self._period_s = env.variant.control_period_s
         self._goal_key: bytes = b""
         self._family: FloatArray = np.empty((0, 7))
+        self._floor_m = 0.0
         self._ruckig = ruckig.Ruckig(7)
         self._input = ruckig.InputParameter(7)
         self._input.max_velocity = list(robot.JOINT_SPEED_RAD_S)
@@ -131,6 +134,10 @@ class Expert:
         truth = self._env.privileged()
         position, normal = truth["goal_position"], truth["goal_normal"]
         self._remember_goal(position, normal)
+        # Distances are to a level plane. Elsewhere than on a flat surface that is the target's
+        # height, which is right near the goal and a guess far from it.
+        level = self._env.variant.surface == "flat"
+        self._floor_m = 0.0 if level else truth["target_position"][2] - CLEARANCE_M
         q, velocity = self._state_when_action_acts()
         target = self._next_set_point(q, velocity, position, normal)
         return np.asarray(self._env.commandable(target), dtype=np.float32)
@@ -171,7 +178,7 @@ class Expert:
         candidates = self._ranked_goals(q, velocity, position, normal)
         if len(candidates) == 0:
             return q  # Out of reach: stand still.
-        required = min(CLEARANCE_M, self._kinematics.clearance(q) - 1e-3)
+        required = min(CLEARANCE_M, self._kinematics.clearance(q, self._floor_m) - 1e-3)
         motion = self._first_clear(q, velocity, candidates, required)
         if motion is None:
             motion = self._escape(q, velocity, position, normal, required)
@@ -287,13 +294,18 @@ class Expert:
         moving = np.where(np.abs(velocity) < 1e-9, 0.0, np.clip(velocity, -speed, speed))
         self._input.current_position = list(start)
         self._input.current_velocity = list(moving)
-        self._input.target_position = list(goal)
         self._input.synchronization = (
             ruckig.Synchronization.Time if together else ruckig.Synchronization.No
         )
         trajectory = ruckig.Trajectory(7)
-        self._ruckig.calculate(self._input, trajectory)
-        return trajectory
+        for nudge in _NUDGES_RAD:
+            self._input.target_position = list(goal + nudge)
+            try:
+                self._ruckig.calculate(self._input, trajectory)
+            except ruckig.RuckigError:
+                continue
+            return trajectory
+        raise RuntimeError(f"ruckig finds no motion from {q} at {velocity} to {goal}")
 
     def _least_clearance(self, motion: ruckig.Trajectory, required: float) -> float:
         """Least clearance (m) along a motion; stops looking once it falls below ``required``.
@@ -304,7 +316,7 @@ class Expert:
         t = 0.0
         while True:
             q = np.asarray(motion.at_time(min(t, motion.duration))[0])
-            clearance = self._kinematics.clearance(q)
+            clearance = self._kinematics.clearance(q, self._floor_m)
             least = min(least, clearance)
             if least < required or t >= motion.duration:
                 return float(least)

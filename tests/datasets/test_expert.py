@@ -90,6 +90,25 @@ def test_stays_where_it_has_arrived():
     assert info["position_error_mm"] < 0.01
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"surface": "tilted"},
+        {"surface": "curved"},
+        {"start": "mixed"},
+        {"start": "random", "time_limit_steps": 40},
+        {"latency_steps": 2},
+        {"acceleration_limits": True},
+    ],
+    ids=str,
+)
+def test_solves_the_task_with_other_options(options):
+    with hvs_suite.load("align-thesis", observations="state", **options) as env:
+        expert = make_expert(env)
+        infos = [play(env, expert, scenario) for scenario in range(5)]
+    assert [info["scenario"] for info in infos if not info["is_success"]] == []
+
+
 def test_aims_with_true_joints_where_the_encoders_are_off():
     with hvs_suite.load("align-thesis", observations="state", joint_offset_deg=1.0) as env:
         assert all(play(env, make_expert(env), scenario)["is_success"] for scenario in range(3))
