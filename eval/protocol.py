@@ -1,17 +1,27 @@
 """How a policy is scored: scenarios 0..N-1 of a split, the task as named, every episode a row."""
 
+import contextlib
 import dataclasses
 import datetime
+import hashlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from pathlib import Path
+from typing import Any, Literal
 
-from hvs_suite import registry, rollout
+from hvs_suite import files, registry, rollout
 from hvs_suite.errors import OptionError, ScenarioError
-from hvs_suite.eval import provenance, result_file
+from hvs_suite.eval import action_log, progress_file, provenance, result_file
+from hvs_suite.eval.trial import PlayTrial, Trial, tolerances
 from hvs_suite.policies.catalogue import policy_factory
+from hvs_suite.policies.imported import ImportedFactory
 from hvs_suite.tasks import lock
 from hvs_suite.tasks.scenario import TEST_SCENARIOS, TEST_SPLIT
+
+DECISION_LIMIT_S = 10.0
+"""A hundred control periods: far above any policy that could be used, below a hung one."""
+
+Progress = Callable[[Trial], None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,87 +31,230 @@ class MakeTask:
     Attributes:
         task: Named task.
         split: Split its scenarios come from.
+        pictures: Draw the observations; a re-simulation needs none.
     """
 
     task: str
     split: str
+    pictures: bool = True
 
     def __call__(self) -> rollout.Environment:
         """Returns a new environment."""
-        env: rollout.Environment = registry.load(self.task, split=self.split)
+        options: dict[str, Any] = {} if self.pictures else {"observations": "state"}
+        env: rollout.Environment = registry.load(self.task, split=self.split, **options)
         return env
 
 
+@dataclasses.dataclass(frozen=True)
+class Contender:
+    """Who is scored, and what the result says of it.
+
+    Attributes:
+        name: As shown in the result.
+        kind: ``builtin``, ``checkpoint``, ``module`` or ``server``.
+        make: Builds it for an environment.
+        hash: As ``policy_hash`` in the result.
+        parameters: As ``policy_parameters``.
+        training_steps: As in the result.
+        training_hours: As in the result.
+    """
+
+    name: str
+    kind: Literal["builtin", "checkpoint", "module", "server"]
+    make: rollout.PolicyFactory
+    hash: str | None = None
+    parameters: int | None = None
+    training_steps: int | None = None
+    training_hours: float | None = None
+
+
+def find(policy: str, task: str) -> Contender:
+    """Finds the policy behind a name.
+
+    Args:
+        policy: As `policy_factory` takes it.
+        task: Named task.
+
+    Raises:
+        UnknownTaskError: There is no such task.
+        PolicyError: There is no such policy, or it does not fit the task.
+    """
+    registry.find(task)
+    make = policy_factory(policy, task)
+    # An absolute path would tell who ran it and where.
+    name = Path(policy).name if Path(policy).is_absolute() else policy
+    if isinstance(make, ImportedFactory):
+        source = make.source()
+        return Contender(
+            name=name,
+            kind="module",
+            make=make,
+            hash=None if source is None else provenance.file_hash(source),
+        )
+    # A policy that comes from a checkpoint, shipped or not, knows its folder.
+    folder: str | None = getattr(make, "folder", None)
+    if folder is None:
+        return Contender(name=name, kind="builtin", make=make)
+    training = provenance.training(Path(folder))
+    return Contender(
+        name=name,
+        kind="checkpoint",
+        make=make,
+        hash=provenance.checkpoint_hash(Path(folder)),
+        parameters=provenance.parameters(Path(folder)),
+        training_steps=training.steps,
+        training_hours=training.hours,
+    )
+
+
 def evaluate(
-    policy: str,
+    policy: str | Contender,
     task: str,
+    out: Path | None = None,
+    *,
     split: str = TEST_SPLIT,
     episodes: int = TEST_SCENARIOS,
     workers: int = 1,
-    progress: Callable[[rollout.Episode], None] | None = None,
+    decision_limit_s: float = DECISION_LIMIT_S,
+    progress: Progress | None = None,
 ) -> result_file.Result:
-    """Scores a policy on the first scenarios of a split.
+    """Scores a policy on the first scenarios of a split and writes the result.
+
+    Interrupted, the same call goes on where it was, and ends in the same result.
 
     Args:
-        policy: Built-in name or checkpoint folder, as `policy_factory` takes it.
+        policy: What `policy_factory` takes, or a contender.
         task: Named task, played as named.
+        out: Result file to write (JSON); the action log and, meanwhile, what is already played
+            stand beside it. None writes nothing.
         split: Split to play; ``test`` for a score, any other name for a look.
         episodes: Scenarios to play: 0 to `episodes` - 1.
         workers: Processes; the episodes are the same for any number.
-        progress: Called after each episode, in the order in which they end.
+        decision_limit_s: Time after which a decision loses its episode (s).
+        progress: Called after each episode, in the order in which they end; at once for those that
+            an interrupted call left.
 
     Returns:
-        The result, ready to be written.
+        The result.
 
     Raises:
         UnknownTaskError: There is no such task.
         PolicyError: There is no such policy, or it does not fit the task.
         ScenarioError: The split does not hold that many scenarios.
-        OptionError: `episodes` or `workers` is below 1.
+        OptionError: `episodes` or `workers` is below 1, or the time limit is not positive.
+        OutputError: The result cannot be written, or the beginning of another one is in its place.
         RenderError: Nothing here can draw the images.
+        ServerError: The policy's server broke off.
     """
     if episodes < 1:
         raise OptionError(f"episodes must be at least 1, not {episodes}")
+    if workers < 1:
+        raise OptionError(f"workers must be at least 1, not {workers}")
+    if not decision_limit_s > 0:
+        raise OptionError(f"the time limit of a decision must be positive, not {decision_limit_s}")
     if split == TEST_SPLIT and episodes > TEST_SCENARIOS:
         raise ScenarioError(
             f"split {TEST_SPLIT!r} holds {TEST_SCENARIOS} scenarios, not {episodes}; ask for "
             f"{TEST_SCENARIOS} episodes or fewer"
         )
     variant = registry.find(task)
-    make_policy = policy_factory(policy, task)
+    contender = find(policy, task) if isinstance(policy, str) else policy
     renderer = provenance.gl_renderer()
+    identity = {
+        "schema_version": result_file.SCHEMA_VERSION,
+        "task": task,
+        "task_digest": lock.digest(task),
+        "split": split,
+        "policy": contender.name,
+        "policy_hash": contender.hash,
+        "decision_limit_s": decision_limit_s,
+        "suite_version": provenance.suite_version(),
+        "packages": provenance.package_versions(),
+        "gl_renderer": renderer,
+        "cpu": provenance.cpu(),
+    }
     created = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    started = time.perf_counter()
-    played = rollout.rollout(
-        MakeTask(task, split), make_policy, range(episodes), workers=workers, on_episode=progress
-    )
-    wall_s = time.perf_counter() - started
-    steps = sum(episode.steps for episode in played)
-    rows = [result_file.EpisodeRow.of(episode) for episode in played]
-    # A policy that comes from a checkpoint, shipped or not, knows its folder.
-    checkpoint: str | None = getattr(make_policy, "folder", None)
-    # An absolute path would tell who ran it and where.
-    name = Path(policy).name if Path(policy).is_absolute() else policy
-    return result_file.Result(
-        schema_version=result_file.SCHEMA_VERSION,
-        summary=result_file.Summary.of(task, name, split, rows),
-        metadata=result_file.Metadata(
-            created=created,
-            suite_version=provenance.suite_version(),
-            task_version=variant.version,
-            task_digest=lock.digest(task),
-            options={},
-            policy_hash=provenance.checkpoint_hash(Path(checkpoint)) if checkpoint else None,
-            packages=provenance.package_versions(),
-            gl_renderer=renderer,
-            cpu=provenance.cpu(),
-            platform=provenance.operating_system(),
-        ),
-        timings=result_file.Timings(
-            workers=workers,
-            wall_s=wall_s,
-            steps_per_s=steps / wall_s,
-            decision_ms=1000 * sum(episode.decision_s for episode in played) / steps,
-        ),
-        episodes=rows,
-    )
+    partial = None if out is None else out.with_name(out.name + progress_file.SUFFIX)
+    if out is not None:
+        files.check_writable(out)
+    with progress_file.ProgressFile(partial, identity) as kept:
+        wall_s = _play_rest(
+            kept,
+            rollout.play(
+                MakeTask(task, split),
+                contender.make,
+                [index for index in range(episodes) if index not in kept.trials],
+                PlayTrial(decision_limit_s),
+                workers=workers,
+            ),
+            progress,
+        )
+        trials = [kept.trials[index] for index in range(episodes)]
+        rows = [trial.row for trial in trials]
+        actions = [trial.actions for trial in trials]
+        log = action_log.encode(actions)
+        steps = sum(map(len, actions))
+        result = result_file.Result(
+            schema_version=result_file.SCHEMA_VERSION,
+            summary=result_file.Summary.of(
+                task,
+                contender.name,
+                split,
+                rows,
+                tolerances=tolerances(variant),
+                time_limit_steps=variant.time_limit_steps,
+            ),
+            metadata=result_file.Metadata(
+                created=created,
+                suite_version=provenance.suite_version(),
+                task_version=variant.version,
+                task_digest=lock.digest(task),
+                tolerances=tolerances(variant),
+                time_limit_steps=variant.time_limit_steps,
+                options={},
+                policy_kind=contender.kind,
+                policy_hash=contender.hash,
+                policy_parameters=contender.parameters,
+                training_steps=contender.training_steps,
+                training_hours=contender.training_hours,
+                decision_limit_s=decision_limit_s,
+                actions_sha256=hashlib.sha256(log).hexdigest(),
+                packages=provenance.package_versions(),
+                gl_renderer=renderer,
+                cpu=provenance.cpu(),
+                platform=provenance.operating_system(),
+            ),
+            timings=result_file.Timings(
+                workers=workers,
+                wall_s=wall_s,
+                steps_per_s=steps / wall_s,
+                decision_ms=1000 * sum(trial.decision_s for trial in trials) / max(steps, 1),
+                decision_ms_max=1000 * max(trial.slowest_s for trial in trials),
+            ),
+            episodes=rows,
+        )
+        if out is not None:
+            # The log first: a result never stands there without the log that it speaks of.
+            with files.replacing(result_file.actions_path(out)) as temporary:
+                temporary.write_bytes(log)
+            result_file.write(result, out)
+        kept.remove()
+    return result
+
+
+def _play_rest(
+    kept: progress_file.ProgressFile,
+    played: Generator[Trial, None, None],
+    progress: Progress | None,
+) -> float:
+    """Keeps trials as they come; returns the wall time over all sittings (s)."""
+    before, started = kept.elapsed_s, time.perf_counter()
+    for trial in kept.trials.values():
+        if progress is not None:
+            progress(trial)
+    with contextlib.closing(played):
+        for trial in played:
+            kept.add(trial, before + time.perf_counter() - started)
+            if progress is not None:
+                progress(trial)
+    return before + time.perf_counter() - started

@@ -1,7 +1,10 @@
 """What a number was made with: versions, renderer, processor, policy weights; no host, no user."""
 
+import dataclasses
 import hashlib
 import importlib.metadata
+import json
+import math
 import platform
 from pathlib import Path
 
@@ -83,3 +86,44 @@ def checkpoint_hash(folder: Path) -> str:
                 content = hashlib.file_digest(file, "sha256").hexdigest()
             digest.update(f"{path.name}\0{content}\n".encode())
     return digest.hexdigest()
+
+
+def file_hash(path: Path) -> str:
+    """Returns the SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def parameters(folder: Path) -> int | None:
+    """Returns how many numbers a checkpoint's ``model.safetensors`` holds; None without one."""
+    try:
+        with (folder / "model.safetensors").open("rb") as file:
+            # The format's own header: eight bytes of length, then JSON with every tensor's shape.
+            header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
+        return sum(
+            math.prod(tensor["shape"]) for name, tensor in header.items() if name != "__metadata__"
+        )
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+@dataclasses.dataclass(frozen=True)
+class Training:
+    """What a checkpoint tells of its training.
+
+    Attributes:
+        steps: Optimiser steps; None if it does not say.
+        hours: Training time (h); None if it does not say.
+    """
+
+    steps: int | None
+    hours: float | None
+
+
+def training(folder: Path) -> Training:
+    """Reads ``training/outcome.json``, which ``hvs pretrain`` leaves in a checkpoint."""
+    try:
+        outcome = json.loads((folder / "training" / "outcome.json").read_bytes())
+        return Training(int(outcome["step"]), float(outcome["train_s"]) / 3600.0)
+    except (OSError, ValueError, KeyError, TypeError):
+        return Training(None, None)

@@ -43,3 +43,7 @@ class PolicyError(HvsError, ValueError):
 
 class ResultError(HvsError, ValueError):
     """An evaluation result that is malformed, duplicate or inconsistent."""
+
+
+class ServerError(HvsError, ConnectionError):
+    """A policy server that cannot be reached, breaks off, or speaks another protocol."""

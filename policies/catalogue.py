@@ -1,9 +1,10 @@
-"""Finds policies by name: the expert, the floor, shipped weights, or a checkpoint folder."""
+"""Finds policies by name: the expert, the floor, shipped weights, a checkpoint, one's own code."""
 
 import difflib
 from pathlib import Path
 
 from hvs_suite.errors import PolicyError, UnknownTaskError
+from hvs_suite.policies import imported
 from hvs_suite.rollout import PolicyFactory
 from hvs_suite.tasks.variants import TASKS
 
@@ -18,7 +19,8 @@ def policy_factory(spec: str, task: str) -> PolicyFactory:
 
     Args:
         spec: ``expert``, ``zero``, ``random``, ``servo``, ``pretrained``, ``finetuned`` (the
-            weights shipped for the task), or a checkpoint folder.
+            weights shipped for the task), a checkpoint folder, or ``module:factory`` for code of
+            one's own, which is imported and run (see `hvs_suite.policies.imported`).
         task: Named task.
 
     Returns:
@@ -43,9 +45,15 @@ def policy_factory(spec: str, task: str) -> PolicyFactory:
             )
         return _checkpoint(folder, task)
     folder = Path(spec)
+    if imported.NAME.fullmatch(spec):
+        return imported.imported_factory(spec)
     if not folder.is_dir():
         close = difflib.get_close_matches(spec, NAMES, n=1)
-        hint = f"did you mean {close[0]}?" if close else f"use {', '.join(NAMES)}, or a folder"
+        hint = (
+            f"did you mean {close[0]}?"
+            if close
+            else f"use {', '.join(NAMES)}, a folder, or module:factory for code of your own"
+        )
         raise PolicyError(f"{spec!r} is neither a policy nor a checkpoint folder; {hint}")
     return _checkpoint(folder, task)
 

@@ -59,7 +59,7 @@ class Demo:
         with _stage(f"score it on {self.evaluations} test scenarios", times_s):
             Evaluate(
                 policy=str(policy),
-                task=TASK,
+                task=(TASK,),
                 split="test",
                 episodes=self.evaluations,
                 workers=2,

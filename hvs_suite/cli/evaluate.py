@@ -1,58 +1,102 @@
 """``hvs evaluate``: score a policy on the first scenarios of a split."""
 
 import dataclasses
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hvs_suite.cli import console
+from hvs_suite.errors import OptionError
 
 if TYPE_CHECKING:
+    from hvs_suite.eval.protocol import Contender
     from hvs_suite.eval.result_file import Result
-    from hvs_suite.rollout import Episode
+    from hvs_suite.eval.trial import Trial
+
+# The first few say what is wrong; a thousand of the same hide it.
+MAX_COMPLAINTS = 3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Evaluate:
     """Score a policy on scenarios 0 to N-1 of a split and write every episode to a result file.
 
+    Interrupted, the same command goes on. A policy that raises, answers nonsense or is too slow
+    loses that episode, and the reason is counted.
+
     Attributes:
-        policy: expert, zero, random, servo, pretrained, finetuned, or a checkpoint folder.
-        task: Named task, such as align-thesis; 'hvs tasks' lists them.
-        out: Result file to write (JSON), replaced if it exists.
+        task: Named task, such as align-thesis; give it several times for several tasks.
+        out: Result file to write (JSON), replaced if it exists; for several tasks, the folder to
+            write <task>.json into.
+        policy: expert, zero, random, servo, pretrained, finetuned, a checkpoint folder, or
+            module:factory, which imports and runs that code. With --server, a name for the result.
         split: Scenarios to play; test holds 1000, any other name has no end.
         episodes: Number of scenarios.
         workers: Processes that share the work; the result is the same for any number.
+        decision_limit: Time after which a decision loses its episode (s).
     """
 
-    policy: str
-    task: str
+    task: tuple[str, ...]
     out: Path
+    policy: str
     split: str = "test"
     episodes: int = 100
     workers: int = 1
+    decision_limit: float = 10.0
 
     def run(self) -> int:
-        """Evaluate, write the result, print its summary."""
-        from hvs_suite import files
-        from hvs_suite.eval import protocol, result_file
+        """Evaluate, write the results, print their summaries."""
+        from hvs_suite import files, registry
 
-        files.check_writable(self.out)
-        n_played = n_success = 0
-        with console.progress(f"{self.policy} on {self.task}", self.episodes) as advance:
+        if not self.task:
+            raise OptionError("name a --task; 'hvs tasks' lists them")
+        if len(set(self.task)) < len(self.task):
+            raise OptionError("a task is named twice; name each --task once")
+        paths = (
+            [self.out] if len(self.task) == 1 else [self.out / f"{task}.json" for task in self.task]
+        )
+        for task, path in zip(self.task, paths, strict=True):
+            registry.find(task)
+            files.check_writable(path)
+        # Every policy is found before the first is played.
+        contenders = [self._find(task) for task in self.task]
+        for task, path, contender in zip(self.task, paths, contenders, strict=True):
+            _print_summary(self._evaluate(task, path, contender))
+            print(f"Written to {path}")
+        return 0
 
-            def note(episode: "Episode") -> None:
-                nonlocal n_played, n_success
+    def _find(self, task: str) -> "Contender":
+        from hvs_suite.eval import protocol
+
+        return protocol.find(self.policy, task)
+
+    def _evaluate(self, task: str, path: Path, contender: "Contender") -> "Result":
+        from hvs_suite.eval import protocol
+
+        n_played = n_success = n_failure = 0
+        with console.progress(f"{contender.name} on {task}", self.episodes) as advance:
+
+            def note(trial: "Trial") -> None:
+                nonlocal n_played, n_success, n_failure
                 n_played += 1
-                n_success += episode.success
+                n_success += trial.row.success
+                if trial.detail:
+                    n_failure += 1
+                    if n_failure <= MAX_COMPLAINTS:
+                        words = " ".join(trial.detail.split())
+                        print(f"scenario {trial.row.scenario} lost: {words}", file=sys.stderr)
                 advance(f"{n_success} of {n_played} solved")
 
-            result = protocol.evaluate(
-                self.policy, self.task, self.split, self.episodes, self.workers, progress=note
+            return protocol.evaluate(
+                contender,
+                task,
+                path,
+                split=self.split,
+                episodes=self.episodes,
+                workers=self.workers,
+                decision_limit_s=self.decision_limit,
+                progress=note,
             )
-        result_file.write(result, self.out)
-        _print_summary(result)
-        print(f"Written to {self.out}")
-        return 0
 
 
 def _print_summary(result: "Result") -> None:
@@ -60,6 +104,7 @@ def _print_summary(result: "Result") -> None:
     summary = result.summary
     low, high = summary.pc_success_ci95
     to_goal = summary.steps_to_goal_mean
+    settled, sharpest = summary.settled_position_error_mm, summary.settled_sharpest_95.scale
     console.print_table(
         ("", "value"),
         [
@@ -69,6 +114,7 @@ def _print_summary(result: "Result") -> None:
             ),
             ("95 % interval", f"{low:.1f} to {high:.1f} %"),
             ("collisions", str(summary.n_collision)),
+            *((f"lost: {reason}", str(n)) for reason, n in summary.failures.items()),
             ("clipped actions", str(summary.n_clipped)),
             ("steps to goal, mean", "-" if to_goal is None else f"{to_goal:.1f}"),
             *(
@@ -82,6 +128,14 @@ def _print_summary(result: "Result") -> None:
                     ("height_error", "mm", summary.height_error_mm),
                     ("tilt_error", "deg", summary.tilt_error_deg),
                 )
+            ),
+            (
+                "settled position error, mm: iqm, p99",
+                f"{settled.iqm:.3f}, {settled.p99:.3f}",
+            ),
+            (
+                "sharpest tolerance met in 95 %",
+                "-" if sharpest is None else f"{sharpest:.3g} of the task's",
             ),
             ("control steps a second", f"{result.timings.steps_per_s:.0f}"),
         ],

@@ -114,7 +114,7 @@ def parse(arguments: Sequence[str]) -> Command:
                 _load(COMMANDS[name]),
                 prog=f"hvs {name}",
                 args=rest,
-                config=(tyro.conf.FlagCreatePairsOff,),
+                config=(tyro.conf.FlagCreatePairsOff, tyro.conf.UseAppendAction),
             )
     except SystemExit as end:
         if end.code in (0, None):

@@ -30,11 +30,11 @@ def test_one_and_two_workers_write_the_same_rows(policy: str, tmp_path: Path) ->
     written = []
     for workers in (1, 2):
         path = tmp_path / f"{workers}.json"
-        result_file.write(
-            protocol.evaluate(policy, "align-thesis", episodes=3, workers=workers), path
-        )
+        protocol.evaluate(policy, "align-thesis", path, episodes=3, workers=workers)
         content = path.read_text()
-        written.append((content[content.index('"episodes"') :], json.loads(content)["summary"]))
+        log = result_file.actions_path(path).read_bytes()
+        rows = content[content.index('"episodes"') :]
+        written.append((rows, json.loads(content)["summary"], log))
     assert written[0] == written[1]
 
 
@@ -63,6 +63,7 @@ def test_metadata_tells_what_was_run_but_not_who_ran_it() -> None:
         ({"episodes": 0}, OptionError),
         ({"episodes": 1001}, ScenarioError),
         ({"workers": 0}, OptionError),
+        ({"decision_limit_s": 0.0}, OptionError),
         ({"split": ""}, ScenarioError),
     ],
 )
@@ -99,6 +100,8 @@ def test_an_unwritable_output_is_found_before_the_work(
         "--policy nobody --task align-easy",
         "--policy zero --task align-easy --episodes 1001",
         "--policy zero --task align-easy --workers 0",
+        "--policy zero --task align-easy --task align-easy",
+        "--policy zero",
     ],
 )
 def test_the_command_answers_bad_input_with_one_line_and_exit_2(

@@ -4,7 +4,17 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from hvs_suite.statistics import interquartile_mean, percentile, wilson_interval
+from hvs_suite.statistics import (
+    interquartile_mean,
+    interquartile_mean_interval,
+    mcnemar,
+    paired_difference,
+    percentile,
+    share_solved_by,
+    share_within,
+    sharpest_tolerance,
+    wilson_interval,
+)
 
 
 @pytest.mark.parametrize("n_total", [1, 2, 7, 60, 1000])
@@ -57,3 +67,97 @@ def test_no_values_have_no_estimate() -> None:
         interquartile_mean([])
     with pytest.raises(ValueError, match="one or more"):
         percentile([[1.0]], 50)
+
+
+@pytest.mark.parametrize("counts", [(0, 0), (1, 0), (5, 9), (30, 12), (600, 700), (1000, 0)])
+def test_mcnemar_agrees_with_scipy(counts: tuple[int, int]) -> None:
+    expected = scipy.stats.binomtest(counts[0], sum(counts)).pvalue if sum(counts) else 1.0
+    assert mcnemar(*counts) == pytest.approx(expected, rel=1e-9)
+    assert mcnemar(*counts[::-1]) == mcnemar(*counts)
+
+
+def test_mcnemar_refuses_negative_counts() -> None:
+    with pytest.raises(ValueError, match="negative"):
+        mcnemar(-1, 3)
+
+
+def test_the_bootstrap_interval_agrees_with_scipy() -> None:
+    values = np.random.default_rng(0).lognormal(size=200)
+    expected = scipy.stats.bootstrap(
+        (values,),
+        lambda sample, axis: scipy.stats.trim_mean(sample, 0.25, axis=axis),
+        n_resamples=4000,
+        method="percentile",
+        rng=np.random.default_rng(1),
+    ).confidence_interval
+    interval = interquartile_mean_interval([values], resamples=4000)
+    # Two sets of resamples differ by a few percent of the interval's width.
+    assert interval == pytest.approx(tuple(expected), abs=0.08 * (expected.high - expected.low))
+
+
+def test_the_bootstrap_interval_covers_the_truth_about_as_often_as_it_says() -> None:
+    random = np.random.default_rng(5)
+    intervals = [interquartile_mean_interval([random.normal(size=60)]) for _ in range(200)]
+    # 95 % of 200 give or take three standard deviations, and the bootstrap's own shortfall.
+    assert 175 <= sum(low <= 0.0 <= high for low, high in intervals) <= 200
+
+
+def test_the_same_values_give_the_same_interval() -> None:
+    values = np.arange(30.0)
+    assert interquartile_mean_interval([values]) == interquartile_mean_interval([values])
+
+
+def test_strata_are_resampled_on_their_own() -> None:
+    # Two tasks without spread: any resample that keeps their sizes has the same mean.
+    low, high = interquartile_mean_interval([np.zeros(10), np.ones(30)])
+    assert low == high == interquartile_mean(np.repeat([0.0, 1.0], [10, 30]))
+
+
+def test_large_samples_are_resampled_in_blocks() -> None:
+    low, high = interquartile_mean_interval([np.random.default_rng(2).normal(size=6000)])
+    assert -0.1 < low < high < 0.1
+
+
+def test_a_paired_difference_cancels_what_scenarios_have_in_common() -> None:
+    random = np.random.default_rng(7)
+    hard = random.normal(scale=100.0, size=50)
+    difference = paired_difference(hard + 1.0, hard)
+    assert difference.estimate == pytest.approx(1.0)
+    assert (difference.low, difference.high) == pytest.approx((1.0, 1.0))
+    noisy = paired_difference(hard, hard + random.normal(size=50))
+    expected = scipy.stats.bootstrap(
+        (hard, hard + 1.0),
+        lambda a, b, axis: (a - b).mean(axis=axis),
+        paired=True,
+        method="percentile",
+        n_resamples=100,
+        rng=random,
+    ).confidence_interval
+    assert (expected.low, expected.high) == pytest.approx((-1.0, -1.0))
+    assert noisy.low <= noisy.estimate <= noisy.high
+
+
+def test_pairs_need_equal_lengths() -> None:
+    with pytest.raises(ValueError, match="equal lengths"):
+        paired_difference([1.0], [1.0, 2.0])
+
+
+def test_success_against_tolerance_agrees_with_scipy() -> None:
+    errors = np.random.default_rng(1).exponential(size=37)
+    tolerances = np.array([0.0, 0.1, errors[3], 1.0, 100.0])
+    expected = 100.0 * scipy.stats.ecdf(errors).cdf.evaluate(tolerances)
+    np.testing.assert_allclose(share_within(errors, tolerances), expected)
+    assert share_within([*errors, np.inf], [1e300])[0] < 100.0
+
+
+def test_the_sharpest_tolerance_is_met_by_enough_and_nothing_sharper_is() -> None:
+    errors = np.arange(1.0, 21.0)
+    assert sharpest_tolerance(errors) == 19.0
+    assert share_within(errors, [19.0])[0] >= 95.0 > share_within(errors, [18.999])[0]
+    assert sharpest_tolerance([1.0] * 18 + [np.inf] * 2) == np.inf
+    with pytest.raises(ValueError, match="percent"):
+        sharpest_tolerance(errors, 0.0)
+
+
+def test_success_against_steps_counts_failures_as_never() -> None:
+    np.testing.assert_allclose(share_solved_by([2, None, 4, 2], 5), [0, 50, 50, 75, 75])

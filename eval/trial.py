@@ -1,0 +1,329 @@
+"""One scenario played for a score: to the goal, and on past it to where the policy settles.
+
+One playing serves both figures. The score is taken at the control step at which the goal has been
+held; the policy, which is not told, plays on to the time limit. Up to the goal the two passes that
+this replaces would be the same episode anyway, since a scenario fixes everything that is random.
+"""
+
+import contextlib
+import dataclasses
+import hashlib
+import random
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import FrameType
+from typing import Any, Protocol
+
+import dm_env
+import numpy as np
+import numpy.typing as npt
+
+from hvs_suite.errors import ServerError
+from hvs_suite.eval.result_file import ERRORS, EpisodeRow
+from hvs_suite.rollout import Action, Observation, Policy
+
+NOT_FINITE = "not finite"
+WRONG_SHAPE = "wrong shape"
+TOO_SLOW = "too slow"
+NEAR_MM = 1e-3
+"""Re-simulated errors may differ by this much (mm): another processor rounds differently."""
+NEAR_DEG = 1e-5
+# A nanometre: enough digits for any judgement, few enough to read.
+_DIGITS = 6
+
+Decide = Callable[[Observation], Action]
+
+
+class Stage(Protocol):
+    """What a trial needs of an environment; `hvs_suite.load` returns one."""
+
+    goal_ends_episode: bool
+
+    @property
+    def info(self) -> Mapping[str, Any]:
+        """Outcome and errors (mm, deg) at the end of the last control step."""
+
+    @property
+    def landing_mm(self) -> npt.NDArray[np.float64]:
+        """Where the flange stands over the target, (2,) mm."""
+
+    @property
+    def variant(self) -> Any:
+        """The task's parameters."""
+
+    def action_spec(self) -> Any:
+        """Returns the `dm_env.specs.BoundedArray` of actions."""
+
+    def reset(self, *, scenario: int | None = None) -> dm_env.TimeStep:
+        """Starts the scenario with this index."""
+
+    def step(self, action: Action) -> dm_env.TimeStep:
+        """Plays one control step."""
+
+
+class EpisodeLostError(Exception):
+    """A policy lost its episode.
+
+    Args:
+        reason: What is counted.
+        detail: What it said, for whoever wants to mend it.
+    """
+
+    def __init__(self, reason: str, detail: str = "") -> None:
+        super().__init__(reason)
+        self.reason = reason
+        self.detail = detail
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Trial:
+    """A played scenario.
+
+    Attributes:
+        row: Its outcome.
+        actions: (settled_steps, 7) float32, as the policy gave them, before clipping.
+        decision_s: Wall time spent in the policy, summed (s).
+        slowest_s: Its longest decision (s).
+        detail: What the policy said when it failed; empty if it did not.
+        nearness: Least distance of an error to its tolerance at the end of any control step, in
+            units of `NEAR_MM` and `NEAR_DEG`: below 1, rounding may have decided the outcome.
+    """
+
+    row: EpisodeRow
+    actions: npt.NDArray[np.float32]
+    decision_s: float
+    slowest_s: float
+    detail: str
+    nearness: float
+
+
+@dataclasses.dataclass(frozen=True)
+class PlayTrial:
+    """Plays a policy's trial in whichever process asks for it, for `rollout.play`.
+
+    Attributes:
+        decision_limit_s: Time after which a decision loses the episode (s).
+    """
+
+    decision_limit_s: float
+
+    def __call__(self, env: Stage, policy: Policy, scenario: int) -> Trial:
+        """Plays one scenario; a policy that breaks down loses it, and nothing else."""
+        return _play_policy(env, policy, scenario, self.decision_limit_s)
+
+
+def play_trial(
+    env: Stage, start: Callable[[], None], decide: Decide, scenario: int
+) -> tuple[EpisodeRow, npt.NDArray[np.float32], float]:
+    """Plays one scenario with a function of the observation.
+
+    Args:
+        env: Left at the last step; its goals no longer end episodes afterwards.
+        start: Called once after the reset.
+        decide: Returns a finite action of the right shape, or raises `EpisodeLostError`; so may
+            `start`.
+        scenario: Index in the environment's split.
+
+    Returns:
+        Row, actions (n, 7) float32 before clipping, and nearness as in `Trial`.
+    """
+    env.goal_ends_episode = False
+    spec = env.action_spec()
+    bounds = _near_bounds(env.variant)
+    time_step = env.reset(scenario=scenario)
+    actions: list[Action] = []
+    n_clipped = 0
+    nearness = np.inf
+    once = False
+    scored: dict[str, Any] | None = None
+    failure: str | None = None
+    info = env.info
+    try:
+        start()
+        while not time_step.last():
+            action = decide(time_step.observation)
+            executed = np.clip(action, spec.minimum, spec.maximum).astype(np.float32)
+            n_clipped += bool(np.any(executed != action))
+            time_step = env.step(executed)
+            actions.append(action)
+            info = env.info
+            nearness = min(nearness, _nearness(info, bounds))
+            if scored is None:
+                once = bool(info["success_once"])
+                if info["is_success"]:
+                    scored = _outcome(info, len(actions), n_clipped, once, None)
+    except EpisodeLostError as error:
+        failure = error.reason
+    if scored is None:
+        scored = _outcome(info, len(actions), n_clipped, once, failure)
+    x, y = env.landing_mm
+    settled: dict[str, Any] = {f"settled_{name}": value for name, value in _errors(info).items()}
+    row = EpisodeRow(
+        scenario=int(scenario),
+        **scored,
+        settled_steps=len(actions),
+        settled_collision=bool(info["collision"]),
+        settled_failure=failure,
+        **settled,
+        settled_x_mm=round(float(x), _DIGITS),
+        settled_y_mm=round(float(y), _DIGITS),
+    )
+    return row, np.array(actions, np.float32).reshape(-1, *spec.shape), nearness
+
+
+def tolerances(variant: Any) -> dict[str, float]:
+    """Returns the bound of each error that a task bounds (mm, deg), by the error's name."""
+    bounds = {name: getattr(variant, name.replace("error", "tolerance")) for name in ERRORS}
+    return {name: float(bound) for name, bound in bounds.items() if bound is not None}
+
+
+def _play_policy(env: Stage, policy: Policy, scenario: int, limit_s: float) -> Trial:
+    """A live policy's trial: times, checks and guards each of its decisions."""
+    shape = env.action_spec().shape
+    times = [0.0]
+    detail = ""
+
+    def guarded(call: Callable[[], Any]) -> Any:
+        nonlocal detail
+        started = time.perf_counter()
+        try:
+            with _deadline(limit_s):
+                answer = call()
+        except ServerError:
+            # The connection broke, not the policy: the run stops, and resumes.
+            raise
+        except _DeadlineError:
+            detail = f"no answer within {limit_s:g} s"
+            raise EpisodeLostError(TOO_SLOW, detail) from None
+        except Exception as error:
+            detail = f"{type(error).__name__}: {error}"
+            raise EpisodeLostError(f"raised {type(error).__name__}", detail) from error
+        times.append(time.perf_counter() - started)
+        if times[-1] > limit_s:
+            detail = f"{times[-1]:.3g} s for a decision, more than {limit_s:g} s"
+            raise EpisodeLostError(TOO_SLOW, detail)
+        return answer
+
+    def decide(observation: Observation) -> Action:
+        nonlocal detail
+        answer = guarded(lambda: policy.select_action(observation))
+        try:
+            return _checked(answer, shape)
+        except EpisodeLostError as failure:
+            detail = failure.detail
+            raise
+
+    def start() -> None:
+        _seed_libraries(env, scenario)
+        guarded(policy.reset)
+
+    row, actions, nearness = play_trial(env, start, decide, scenario)
+    return Trial(
+        row=row,
+        actions=actions,
+        decision_s=sum(times),
+        slowest_s=max(times),
+        detail=detail,
+        nearness=nearness,
+    )
+
+
+def _checked(answer: Any, shape: Sequence[int]) -> Action:
+    """Returns a policy's answer as a float32 copy.
+
+    Raises:
+        EpisodeLostError: It is no action.
+    """
+    try:
+        action = np.array(answer, dtype=np.float32)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise EpisodeLostError(WRONG_SHAPE, f"{type(answer).__name__} is no array") from error
+    if action.shape != tuple(shape):
+        raise EpisodeLostError(WRONG_SHAPE, f"shape {action.shape} instead of {tuple(shape)}")
+    if not np.all(np.isfinite(action)):
+        raise EpisodeLostError(NOT_FINITE, "NaN or infinity in the action")
+    return action
+
+
+def _seed_libraries(env: Stage, scenario: int) -> None:
+    """Starts the global generators anew for each scenario.
+
+    The suite uses none of them. Policies written elsewhere do (diffusion policies draw their noise
+    from torch's), and would otherwise depend on which scenarios a worker played before.
+    """
+    seed = episode_seed(env.info["split"], scenario)
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002 - this is the generator that others use
+    if (torch := sys.modules.get("torch")) is not None:
+        torch.manual_seed(seed)
+
+
+def episode_seed(split: str, scenario: int) -> int:
+    """Returns the seed that a policy may draw from in a scenario, in [0, 2^32)."""
+    digest = hashlib.sha256(f"episode {split} {scenario}".encode()).digest()
+    return int.from_bytes(digest[:4], "little")
+
+
+class _DeadlineError(BaseException):
+    """No `Exception`: a policy that catches those must not catch this."""
+
+
+@contextlib.contextmanager
+def _deadline(seconds: float) -> Iterator[None]:
+    """Raises `_DeadlineError` in the block after a time; in other threads than the main, never."""
+    if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "SIGALRM"):
+        yield
+        return
+
+    def strike(signal_number: int, frame: FrameType | None) -> None:
+        raise _DeadlineError
+
+    handler = signal.signal(signal.SIGALRM, strike)
+    before, _ = signal.setitimer(signal.ITIMER_REAL, seconds)
+    started = time.monotonic()
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, handler)
+        if before:
+            # Somebody else's timer (a test runner's) goes on as if we had not been here.
+            left = max(before - (time.monotonic() - started), 1e-3)
+            signal.setitimer(signal.ITIMER_REAL, left)
+
+
+def _outcome(
+    info: Mapping[str, Any], steps: int, n_clipped: int, once: bool, failure: str | None
+) -> dict[str, Any]:
+    """The scored part of a row."""
+    success = bool(info["is_success"]) and failure is None
+    return {
+        "success": success,
+        "success_once": once,
+        "collision": bool(info["collision"]),
+        "truncated": bool(info["truncated"]) and not success,
+        "steps": steps,
+        "steps_to_goal": steps if success else None,
+        "n_clipped": n_clipped,
+        **_errors(info),
+        "failure": failure,
+    }
+
+
+def _errors(info: Mapping[str, Any]) -> dict[str, float]:
+    return {name: round(float(info[name]), _DIGITS) for name in ERRORS}
+
+
+def _near_bounds(variant: Any) -> list[tuple[str, float, float]]:
+    """Name, bound and unit of nearness of each bounded error."""
+    return [
+        (name, bound, NEAR_DEG if name.endswith("deg") else NEAR_MM)
+        for name, bound in tolerances(variant).items()
+    ]
+
+
+def _nearness(info: Mapping[str, Any], bounds: Sequence[tuple[str, float, float]]) -> float:
+    return min(abs(float(info[name]) - bound) / unit for name, bound, unit in bounds)
