@@ -23,6 +23,7 @@ from hvs_suite.cell.robot import (
     JOINT_SPEED_RAD_S,
     SHELL_GROUP,
 )
+from hvs_suite.errors import OptionError
 from hvs_suite.tasks import actions, appearance, observations, rewards
 from hvs_suite.tasks.scenario import Scenario, ScenarioSource
 from hvs_suite.tasks.variants import AlignVariant
@@ -39,6 +40,11 @@ class Align(ServoTask):
     Args:
         variant: All parameters.
         split: Name of the stream of scenarios.
+
+    Raises:
+        OptionError: The control period is no multiple of the physics timestep, or a goal that was
+            asked for is out of reach.
+        ScenarioError: The split's name is empty.
     """
 
     def __init__(self, variant: AlignVariant, split: str = "train") -> None:
@@ -57,10 +63,14 @@ class Align(ServoTask):
         self.time_limit_steps = variant.time_limit_steps
         self.camera_side = max(variant.eih_resolution, variant.eth_resolution)
         self.multisampling = variant.multisampling
-        self.set_timesteps(
-            control_timestep=variant.control_period_s,
-            physics_timestep=self._cell.mjcf_model.option.timestep,
-        )
+        timestep = float(self._cell.mjcf_model.option.timestep)
+        substeps = variant.control_period_s / timestep
+        if round(substeps) < 1 or abs(substeps - round(substeps)) > 1e-6:
+            raise OptionError(
+                f"control_period_s is {variant.control_period_s}; use a whole multiple of the "
+                f"physics timestep of 1/{1.0 / timestep:.0f} s"
+            )
+        self.set_timesteps(control_timestep=variant.control_period_s, physics_timestep=timestep)
         self._observables = observations.make_observables(self)
         bounds = {
             "position_error_mm": variant.position_tolerance_mm,

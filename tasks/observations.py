@@ -25,7 +25,9 @@ FloatArray = npt.NDArray[np.float64]
 POSITION_BOUND_RAD = JOINT_RANGE_RAD + 0.05
 """Bound of measured joint angles: the range, the encoder's zero error and the stop's give."""
 SPEED_BOUND_RAD_S = 2.0 * JOINT_SPEED_RAD_S
-"""Bound of measured joint speeds; the arm overshoots its set point's speed when that jumps."""
+"""Where measured joint speeds saturate. An arm whose set point jumps to and fro falls behind at its
+torque limit and catches up faster than the set point moves; measurements still keep their bounds.
+"""
 DEPTH_BOUND_M = 20.0
 _STATE_BOUND_M = 3.0
 # One bank of unit noise, cut into frames at random places, costs a tenth of drawing it anew.
@@ -135,7 +137,11 @@ def _vector(task: "Align", name: str) -> VectorObservable:
             return np.clip(read(physics) / scale, -1.0, 1.0)
 
         return VectorObservable(normalised, specs.BoundedArray((7,), np.float32, -1.0, 1.0))
-    return VectorObservable(read, specs.BoundedArray(bound.shape, np.float64, -bound, bound))
+
+    def saturated(physics: mjcf.Physics) -> FloatArray:
+        return np.clip(read(physics), -bound, bound)
+
+    return VectorObservable(saturated, specs.BoundedArray(bound.shape, np.float64, -bound, bound))
 
 
 def _noise_bank(sigma: float) -> npt.NDArray[np.int16]:

@@ -256,7 +256,7 @@ def with_options(variant: AlignVariant, options: Mapping[str, Any]) -> AlignVari
     fields = {field.name for field in dataclasses.fields(AlignVariant)} - {"name", "version"}
     for name in options:
         if name not in fields:
-            close = difflib.get_close_matches(name, fields, n=2)
+            close = difflib.get_close_matches(name, sorted(fields), n=2)
             hint = f"; did you mean {' or '.join(close)}?" if close else ""
             raise OptionError(f"{variant.name} has no option {name!r}{hint}")
     values: dict[str, Any] = {
@@ -269,8 +269,9 @@ def _check_types(variant: AlignVariant) -> None:
     hints = typing.get_type_hints(AlignVariant)
     for field in dataclasses.fields(variant):
         value = getattr(variant, field.name)
-        if not _fits(value, hints[field.name]):
-            wanted = str(field.type).replace("typing.", "")
+        hint = hints[field.name]
+        if not _fits(value, hint):
+            wanted = hint.__name__ if isinstance(hint, type) else str(hint).replace("typing.", "")
             raise OptionError(f"{field.name} is {value!r}, which is not {wanted}")
 
 

@@ -1,0 +1,78 @@
+"""Light, colour and texture of a scenario: drawn, seen in the pictures, and undone by the next."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+import hvs_suite
+from hvs_suite.cell.environment import Environment
+from hvs_suite.tasks.appearance import surface_texture
+from hvs_suite.tasks.detection import find_disc
+
+Named = Callable[..., Environment]
+
+
+@pytest.mark.parametrize("option", ["vary_light", "vary_colour", "vary_texture"])
+def test_each_disturbance_shows_in_the_pictures_by_itself(option: str) -> None:
+    with hvs_suite.load("align-easy", goal=(0.5, 0.2), **{option: True}) as env:
+        looks = [env.reset(scenario=i).observation["eth"] for i in range(3)]
+        for i, look in enumerate(looks):
+            assert (look != looks[i - 1]).mean() > 0.02
+        # The scene is the same otherwise, and comes back bit for bit.
+        np.testing.assert_array_equal(env.reset(scenario=0).observation["eth"], looks[0])
+
+
+def test_without_disturbances_all_scenes_look_alike() -> None:
+    with hvs_suite.load("align-easy", goal=(0.5, 0.2)) as env:
+        looks = [env.reset(scenario=i).observation["eth"] for i in range(3)]
+        np.testing.assert_array_equal(looks[0], looks[1])
+        np.testing.assert_array_equal(looks[0], looks[2])
+
+
+def test_a_texture_reaches_the_pictures_for_people_too() -> None:
+    with hvs_suite.load("align-easy", goal=(0.5, 0.2), vary_texture=True) as env:
+        env.reset(scenario=0)
+        one = env.render(120, 120, "eth")
+        env.reset(scenario=1)
+        assert (env.render(120, 120, "eth") != one).mean() > 0.05
+        env.reset(scenario=0)
+        np.testing.assert_array_equal(env.render(120, 120, "eth"), one)
+
+
+def test_textures_are_keyed_pictures_with_some_contrast() -> None:
+    one = surface_texture(5)
+    assert (one.shape, one.dtype) == ((128, 128), np.uint8)
+    np.testing.assert_array_equal(surface_texture(5), one)
+    assert (surface_texture(6) != one).mean() > 0.9
+    assert one.std() > 5
+
+
+@pytest.mark.parametrize("task", hvs_suite.TASKS)
+def test_the_target_can_be_found_by_its_colour_under_the_task_s_own_disturbances(
+    named: Named, task: str
+) -> None:
+    env = named(task)
+    misses = []
+    for index in range(25):
+        seen = env.reset(scenario=index).observation
+        u, v, _, visible = env.task.target_in_image(env.physics, "eth")
+        if visible:
+            found = find_disc(seen["eth"])
+            true = (np.array([u, v]) + 1) / 2 * env.variant.eth_resolution - 0.5
+            misses.append(np.inf if found is None else np.linalg.norm(found.centre - true))
+    assert len(misses) > 15
+    assert np.mean(np.array(misses) <= 1.5) >= 0.9
+
+
+def test_nothing_else_in_the_cell_is_as_red_as_the_target(named: Named) -> None:
+    """Where the target is out of view, nothing is found."""
+    env = named("align-hard")
+    for index in range(10):
+        seen = env.reset(scenario=index).observation
+        if not env.privileged()["target_eih"][3]:
+            ids = env.renderer.segmentation(
+                env.physics.data.ptr, env.task.cameras["eih"].id, 112, 112
+            )
+            if not (ids == env.task.marker_geom).any():
+                assert find_disc(seen["eih"]) is None, index
