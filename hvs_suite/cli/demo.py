@@ -12,6 +12,8 @@ from hvs_suite.cli import console
 from hvs_suite.errors import OptionError, OutputError
 
 TASK = "align-easy"
+# Without disturbed episodes and starts near the goal, a policy never learns to correct itself.
+NOISE_RAD = 0.02
 PARTS = ("dataset", "policy", "results", "board", "episode.gif")
 
 
@@ -30,8 +32,8 @@ class Demo:
     """
 
     out: Path = Path("runs/demo")
-    episodes: int = 150
-    minutes: float = 3.0
+    episodes: int = 250
+    minutes: float = 4.0
     evaluations: int = 50
     overwrite: bool = False
 
@@ -53,7 +55,14 @@ class Demo:
         times_s: dict[str, float] = {}
 
         with _stage(f"record {self.episodes} demonstrations of {TASK}", times_s):
-            Record(task=TASK, episodes=self.episodes, out=dataset, workers=2).run()
+            Record(
+                task=TASK,
+                episodes=self.episodes,
+                out=dataset,
+                start="mixed",
+                noise=NOISE_RAD,
+                workers=2,
+            ).run()
         with _stage(f"train a policy on them for {self.minutes:g} min", times_s):
             Pretrain(data=dataset, out=policy, minutes=self.minutes).run()
         with _stage(f"score it on {self.evaluations} test scenarios", times_s):

@@ -26,6 +26,7 @@ COMMANDS = {
     "record": "hvs_suite.cli.record:Record",
     "pretrain": "hvs_suite.cli.pretrain:Pretrain",
     "evaluate": "hvs_suite.cli.evaluate:Evaluate",
+    "verify": "hvs_suite.cli.verify:Verify",
     "leaderboard": "hvs_suite.cli.leaderboard:Leaderboard",
     "bench": "hvs_suite.cli.bench:Bench",
     "doctor": "hvs_suite.cli.doctor:Doctor",

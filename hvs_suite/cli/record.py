@@ -4,7 +4,7 @@ import dataclasses
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from hvs_suite.cli import console
 
@@ -24,6 +24,8 @@ class Record:
         out: Root folder of the dataset; must not exist or be empty, unless --resume is given.
         split: Name of the split the scenarios come from.
         resume: Go on with a recording that was interrupted.
+        start: Where the arm starts, if not where the task says; mixed starts half of the episodes
+            near the goal.
         noise: Standard deviation of a disturbance of the executed joint targets, far from the goal
             (rad); the expert's own action stays the label.
         workers: Processes that play episodes.
@@ -34,6 +36,7 @@ class Record:
     out: Path
     split: str = "train"
     resume: bool = False
+    start: Literal["zero", "random", "near_goal", "mixed"] | None = None
     noise: float = 0.0
     workers: int = 1
 
@@ -47,6 +50,7 @@ class Record:
                 self.episodes,
                 self.split,
                 self.out,
+                {} if self.start is None else {"start": self.start},
                 workers=self.workers,
                 noise=self.noise,
                 resume=self.resume,
