@@ -106,7 +106,7 @@ class CheckpointPolicy:
         Returns:
             (7,) float32.
         """
-        with _one_thread(), torch.no_grad():
+        with _one_thread(), torch.inference_mode():
             action = self._decide(self._batch(observation))
         return np.array(action.reshape(-1).cpu().numpy(), np.float32)
 
