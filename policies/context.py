@@ -1,12 +1,14 @@
 """What a policy that is not ours may know of a task: its name, its spaces, its nominal figures.
 
-Built-in policies get the environment itself (the expert reads the true state). Everybody else gets
-a `PolicyContext`: what the task's preset shows, and nothing that only training may see.
+The expert, which reads the true state, and random, which starts its stream from the scenario, get
+the environment itself. Everybody else gets a `PolicyContext`: what the task's preset shows, and
+nothing that only training may see.
 """
 
 import dataclasses
 from typing import Any, Self
 
+from hvs_suite.rollout import Policy, PolicyFactory
 from hvs_suite.tasks.variants import AlignVariant
 
 
@@ -36,6 +38,25 @@ class PolicyContext:
             period_s=env.variant.control_period_s,
         )
 
+    def observation_spec(self) -> dict[str, Any]:
+        """Shape, type and bounds of each observation, by the environment's own name for it."""
+        return self.observations
+
     def action_spec(self) -> Any:
         """Shape and bounds of an action, by the environment's own name for it."""
         return self.action
+
+
+@dataclasses.dataclass(frozen=True)
+class Blindfolded:
+    """Builds a policy that gets to know no more than a `PolicyContext`.
+
+    Attributes:
+        make: Builds the policy for a context.
+    """
+
+    make: PolicyFactory
+
+    def __call__(self, env: Any) -> Policy:
+        """Builds the policy for an environment that it never gets hold of."""
+        return self.make(PolicyContext.of(env))

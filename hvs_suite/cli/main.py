@@ -27,6 +27,8 @@ COMMANDS = {
     "pretrain": "hvs_suite.cli.pretrain:Pretrain",
     "evaluate": "hvs_suite.cli.evaluate:Evaluate",
     "verify": "hvs_suite.cli.verify:Verify",
+    "compare": "hvs_suite.cli.compare:Compare",
+    "import-lerobot": "hvs_suite.cli.import_lerobot:ImportLerobot",
     "leaderboard": "hvs_suite.cli.leaderboard:Leaderboard",
     "bench": "hvs_suite.cli.bench:Bench",
     "doctor": "hvs_suite.cli.doctor:Doctor",
@@ -141,7 +143,7 @@ def _overview() -> str:
     ]
     for name, where in COMMANDS.items():
         summary = (inspect.getdoc(_load(where)) or "").partition("\n")[0]
-        lines.append(f"  {name:<13}{summary}")
+        lines.append(f"  {name:<16}{summary}")
     return "\n".join([*lines, "", "'hvs COMMAND --help' explains the options of a command."])
 
 

@@ -1,0 +1,197 @@
+"""Two policies on the same scenarios: who is better, and how sure one can be of it."""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+from hvs_suite import statistics
+from hvs_suite.errors import ResultError
+from hvs_suite.eval import lerobot_import, result_file
+from hvs_suite.eval.result_file import EpisodeRow
+from hvs_suite.statistics import Difference
+
+SIGNIFICANT = 0.05
+
+
+@dataclasses.dataclass(frozen=True)
+class Side:
+    """What a comparison needs of a result.
+
+    Attributes:
+        name: Policy.
+        task: Named task.
+        split: Split.
+        digest: Digest of the task; None where the file does not tell (imported).
+        success: Outcome by scenario.
+        rows: Rows by scenario; empty for an imported result.
+    """
+
+    name: str
+    task: str
+    split: str
+    digest: str | None
+    success: Mapping[int, bool]
+    rows: Mapping[int, EpisodeRow]
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """Two policies, A and B, over the scenarios that both played.
+
+    Attributes:
+        task: Named task.
+        a: Name of the first policy.
+        b: Name of the second.
+        n: Scenarios that both played.
+        n_both: Solved by both.
+        n_only_a: Solved by A alone.
+        n_only_b: Solved by B alone.
+        n_neither: Solved by neither.
+        p: Two-sided p-value of McNemar's exact test.
+        success: Success rate, A minus B (percentage points).
+        settled_position_mm: Settled position error, A minus B (mm); None for imported
+            results.
+        settled_tilt_deg: Settled tilt error, A minus B (deg); None for imported results.
+        steps_to_goal: Steps to goal, A minus B, over scenarios that both solved (control steps).
+        unverified: Names of policies whose result is an import.
+    """
+
+    task: str
+    a: str
+    b: str
+    n: int
+    n_both: int
+    n_only_a: int
+    n_only_b: int
+    n_neither: int
+    p: float
+    success: Difference
+    settled_position_mm: Difference | None
+    settled_tilt_deg: Difference | None
+    steps_to_goal: Difference | None
+    unverified: tuple[str, ...]
+
+    def conclusion(self) -> str:
+        """Returns what may honestly be said, in one sentence."""
+        rates = (
+            f"{self.a} solves {self.n_both + self.n_only_a} and {self.b} "
+            f"{self.n_both + self.n_only_b} of the same {self.n} scenarios of {self.task}"
+        )
+        tests = (
+            f"p = {self.p:.2g}, difference {self.success.estimate:+.1f} percentage points, 95 % "
+            f"interval {self.success.low:+.1f} to {self.success.high:+.1f}"
+        )
+        caveat = (
+            f", if the unverified result of {' and '.join(self.unverified)} is true"
+            if self.unverified
+            else ""
+        )
+        if self.p < SIGNIFICANT:
+            better, worse = (self.a, self.b) if self.success.estimate > 0 else (self.b, self.a)
+            return f"{better} succeeds more often than {worse}{caveat}: {rates} ({tests})."
+        if not self.n_only_a + self.n_only_b:
+            return (
+                f"No difference in success shows{caveat}: {rates}, and they are the same scenarios."
+            )
+        return (
+            f"These scenarios do not tell which of {self.a} and {self.b} succeeds more "
+            f"often{caveat}: {rates} ({tests})."
+        )
+
+
+def compare(first: Path, second: Path) -> Comparison:
+    """Compares two results of the same task on the scenarios that both played.
+
+    Args:
+        first: Result file, ours or imported.
+        second: Another.
+
+    Raises:
+        ResultError: A file is refused, or the two cannot be compared.
+    """
+    a, b = load_side(first), load_side(second)
+    for what, ours, theirs in (
+        ("task", a.task, b.task),
+        ("split", a.split, b.split),
+        ("task_digest", a.digest, b.digest),
+    ):
+        if ours != theirs and None not in (ours, theirs):
+            raise ResultError(
+                f"{first} and {second} cannot be compared: {what} is {ours!r} and {theirs!r}"
+            )
+    common = sorted(a.success.keys() & b.success.keys())
+    if not common:
+        raise ResultError(f"{first} and {second} have no scenario in common")
+    pairs = [(a.success[index], b.success[index]) for index in common]
+    only_a, only_b = pairs.count((True, False)), pairs.count((False, True))
+    rows = [(a.rows[i], b.rows[i]) for i in common if i in a.rows and i in b.rows]
+    steps = [(ours.steps, theirs.steps) for ours, theirs in rows if ours.success and theirs.success]
+    names = (a.name, b.name) if a.name != b.name else (f"{a.name} (A)", f"{b.name} (B)")
+    return Comparison(
+        task=a.task,
+        a=names[0],
+        b=names[1],
+        n=len(common),
+        n_both=pairs.count((True, True)),
+        n_only_a=only_a,
+        n_only_b=only_b,
+        n_neither=pairs.count((False, False)),
+        p=statistics.mcnemar(only_a, only_b),
+        success=statistics.paired_difference(
+            [100.0 * ours for ours, _ in pairs], [100.0 * theirs for _, theirs in pairs]
+        ),
+        settled_position_mm=_difference(rows, "settled_position_error_mm"),
+        settled_tilt_deg=_difference(rows, "settled_tilt_error_deg"),
+        steps_to_goal=(
+            statistics.paired_difference(
+                [ours for ours, _ in steps], [theirs for _, theirs in steps]
+            )
+            if steps
+            else None
+        ),
+        unverified=tuple(
+            name for name, side in zip(names, (a, b), strict=True) if side.digest is None
+        ),
+    )
+
+
+def load_side(path: Path) -> Side:
+    """Reads a result of ours, or an imported one.
+
+    Raises:
+        ResultError: It is neither.
+    """
+    try:
+        imported = lerobot_import.is_imported(json.loads(path.read_bytes()))
+    except (OSError, ValueError):
+        # The reader below says it better.
+        imported = False
+    if imported:
+        claim = lerobot_import.load(path)
+        return Side(
+            name=claim.summary.policy,
+            task=claim.summary.task,
+            split=claim.summary.split,
+            digest=None,
+            success={row.scenario: row.success for row in claim.episodes},
+            rows={},
+        )
+    result = result_file.load(path)
+    return Side(
+        name=result.summary.policy,
+        task=result.summary.task,
+        split=result.summary.split,
+        digest=result.metadata.task_digest,
+        success={row.scenario: row.success for row in result.episodes},
+        rows={row.scenario: row for row in result.episodes},
+    )
+
+
+def _difference(rows: list[tuple[EpisodeRow, EpisodeRow]], name: str) -> Difference | None:
+    if not rows:
+        return None
+    ours, theirs = zip(*rows, strict=True)
+    return statistics.paired_difference(
+        [getattr(row, name) for row in ours], [getattr(row, name) for row in theirs]
+    )

@@ -1,0 +1,68 @@
+"""``hvs verify``: play a result's logged actions again and recompute its numbers."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from hvs_suite.cli import console
+from hvs_suite.errors import ResultError, UnknownTaskError
+
+BROKEN = 1
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Verify:
+    """Play the logged actions of results again, without pictures, and recompute every number.
+
+    Exits with 1 and the reason if a file is not what it says it is.
+
+    Attributes:
+        files: Result files, or folders of them.
+        sample: Scenarios of each file to play again, drawn by its hash; all by default.
+        submission: Also hold the files against the rules of the board (eval/SUBMITTING.md).
+        results: With --submission, the folder that holds <policy>/<task>.json.
+        workers: Processes that share the work.
+        json: Print what was found as JSON.
+    """
+
+    files: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FILE")]
+    sample: int | None = None
+    submission: bool = False
+    results: Path = Path("eval/results")
+    workers: int = 1
+    json: bool = False
+
+    def run(self) -> int:
+        """Verify the files one after the other; stop at the first that fails."""
+        from hvs_suite.eval import result_file, submission, verification
+
+        paths = verification.results_in(self.files)
+        found = []
+        try:
+            if self.submission:
+                submission.check(paths, self.results)
+            for path in paths:
+                n = result_file.load(path).summary.n_episodes
+                n = n if self.sample is None else min(n, self.sample)
+                with console.progress(f"verify {path}", n) as advance:
+                    verdict = verification.verify(
+                        path, sample=self.sample, workers=self.workers, progress=advance
+                    )
+                found.append(verification.as_json(path, verdict))
+                if not self.json:
+                    near = f", {verdict.n_near} decided by rounding" if verdict.n_near else ""
+                    print(
+                        f"{path}: as it says; {verdict.n_played} of {verdict.n_episodes} scenarios "
+                        f"played again{near}, largest difference {verdict.largest_mm:.1e} mm and "
+                        f"{verdict.largest_deg:.1e} deg"
+                    )
+        except (ResultError, UnknownTaskError) as error:
+            from hvs_suite.cli.main import complain
+
+            complain(str(error))
+            return BROKEN
+        if self.json:
+            console.print_json(found)
+        return 0
