@@ -13,9 +13,12 @@ import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 
-# A target's green and blue stay below this share of its red; the robot's orange has more green.
-_MAX_OTHER = 0.40
+# Warm pixels are the target's red and the robot's orange alike. Pixel noise would cut holes into
+# either if the limit ran between them, so whole patches are told apart, by their mean colour.
+_MAX_OTHER_PIXEL = 0.55
 _MIN_RED_LEAD = 25
+_MAX_OTHER_PATCH = 0.35
+_MIN_PIXELS = 2
 _MAX_BLOBS = 6
 # Rows and columns around a blob that hold its edge, and the background beyond.
 _EDGE_PX = 2
@@ -48,14 +51,20 @@ def find_blobs(image: npt.NDArray[np.uint8]) -> list[Blob]:
     """
     red = image[..., 0].astype(np.int16)
     other = np.maximum(image[..., 1], image[..., 2]).astype(np.int16)
-    mask = (other < _MAX_OTHER * red) & (red - other > _MIN_RED_LEAD)
-    if not mask.any():
+    warm = (other < _MAX_OTHER_PIXEL * red) & (red - other > _MIN_RED_LEAD)
+    if not warm.any():
         return []
     count, labels, stats, _ = cv2.connectedComponentsWithStats(
-        mask.astype(np.uint8), connectivity=8
+        warm.astype(np.uint8), connectivity=8
     )
-    order = 1 + np.argsort(-stats[1:count, cv2.CC_STAT_AREA], kind="stable")[:_MAX_BLOBS]
-    return [_measure(image, labels, stats[label], int(label)) for label in order]
+    owner = labels[warm]
+    sums = [np.bincount(owner, image[..., c][warm], count) for c in range(3)]
+    is_red = np.maximum(sums[1], sums[2]) < _MAX_OTHER_PATCH * sums[0]
+    is_red &= stats[:, cv2.CC_STAT_AREA] >= _MIN_PIXELS
+    is_red[0] = False
+    found = np.flatnonzero(is_red)
+    found = found[np.argsort(-stats[found, cv2.CC_STAT_AREA], kind="stable")][:_MAX_BLOBS]
+    return [_measure(image, labels, stats[label], int(label)) for label in found]
 
 
 def _measure(

@@ -1,9 +1,9 @@
 """``servo``: classical hybrid visual servoing, as a practitioner would write it; no learning.
 
 It sees the observations alone and knows what the cell's manual says: the task's parameters, the
-robot's kinematics, both cameras' nominal calibration, and that the surface is the plane z = 0. It
-is not told what a scenario disturbs (pose of the eye-to-hand camera, encoder zeros, colours,
-latency), and reads none of it.
+robot's kinematics, both cameras' nominal calibration with its published accuracy, and that the
+surface is the plane z = 0. It is not told what a scenario disturbs (pose of the eye-to-hand camera,
+encoder zeros, colours) nor the latency, which it notices by itself.
 
 A decision is:
 
@@ -175,6 +175,7 @@ class Servo:
             np.array(variant.eth_position_m),
             look_at(variant.eth_position_m, variant.eth_look_at_m),
         )
+        self._eth_sigma_m = _calibration_sigma(variant)
         self._half_view = float(np.tan(np.radians(variant.eih_fov_deg) / 2.0)) * _VIEW_SHARE
         self.reset()
 
@@ -182,7 +183,7 @@ class Servo:
         """Forget the last episode."""
         self._belief.reset()
         self._search.reset()
-        self._estimate = TargetEstimate()
+        self._estimate = TargetEstimate(self._eth_sigma_m)
         self._hand: tuple[FloatArray, FloatArray] | None = None
         self._look: FloatArray | None = None
         self._misses = 0
@@ -235,9 +236,7 @@ class Servo:
                 side = self._variant.eth_resolution
                 self._search.rule_out(q, self._eth_K, self._eth_T, side, own=False)
 
-    def _sighting(
-        self, image: npt.NDArray[Any], K: FloatArray, T: FloatArray
-    ) -> Sighting | None:
+    def _sighting(self, image: npt.NDArray[Any], K: FloatArray, T: FloatArray) -> Sighting | None:
         """The first patch of a picture that can be the target."""
         for blob in find_blobs(image):
             sighting = self._sight.sighting(blob, K, T, self._estimate.surface_m)
@@ -255,7 +254,7 @@ class Servo:
             return
         self._misses += 1
         if self._misses > _MAX_MISSES:
-            self._estimate = TargetEstimate()
+            self._estimate = TargetEstimate(self._eth_sigma_m)
             self._search.reset()
             self._look, self._misses = None, 0
 
@@ -316,6 +315,13 @@ def _within_reach(goal: FloatArray) -> FloatArray:
     radius = max(float(np.hypot(goal[0], goal[1])), 1e-6)
     scale = np.clip(radius, inner, outer) / radius
     return np.array([goal[0] * scale, goal[1] * scale, goal[2]])
+
+
+def _calibration_sigma(variant: AlignVariant) -> float:
+    """What the published accuracy of the eye-to-hand calibration means on the surface (m)."""
+    distance = float(np.linalg.norm(np.subtract(variant.eth_position_m, variant.eth_look_at_m)))
+    turn = np.radians(variant.eth_rotation_noise_deg)
+    return float(np.hypot(variant.eth_position_noise_m, distance * turn))
 
 
 def _check(variant: AlignVariant) -> None:

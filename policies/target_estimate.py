@@ -22,10 +22,9 @@ DISC_PLANE_M = 2.0 * HALF_THICKNESS_M
 DRAWN_AREA = float(np.sin(2.0 * np.pi / 20) / (2.0 * np.pi / 20))
 
 # Standard deviations. A centre of area is good to a fraction of a pixel, less where few pixels
-# show it; a camera is mounted, and encoders are zeroed, to about the following.
+# show it; encoders are zeroed to about the following.
 _CENTRE_PX = 0.08
 _CENTRE_SMALL_PX = 0.6
-_ETH_CALIBRATION_M = 0.03
 _ENCODER_RAD = 0.001
 _HEIGHT_PRIOR_M = 0.001
 _EDGE_PX = 0.06
@@ -173,9 +172,15 @@ class TargetEstimate:
     The eye-to-hand camera's calibration error is common to all its pictures, so they are averaged
     first and the error is added once. The eye-in-hand camera's error changes as the arm moves: its
     estimate is a Kalman filter whose uncertainty grows with the way of the hand.
+
+    Args:
+        eth_sigma_m: Standard deviation that the eye-to-hand camera's calibration has on the
+            surface (m).
     """
 
-    def __init__(self) -> None:
+    def __init__(self, eth_sigma_m: float) -> None:
+        # Never quite 0: nobody can be sure of a pose to a hundredth of a millimetre.
+        self._eth_variance = eth_sigma_m**2 + 1e-10
         self._eth_information = np.zeros((2, 2))
         self._eth_weighted = np.zeros(2)
         self._eih_place: FloatArray | None = None
@@ -206,7 +211,7 @@ class TargetEstimate:
         information, weighted = np.zeros((2, 2)), np.zeros(2)
         if self._eth_information.any():
             picture = np.linalg.inv(self._eth_information)
-            eth = np.linalg.inv(picture + _ETH_CALIBRATION_M**2 * np.eye(2))
+            eth = np.linalg.inv(picture + self._eth_variance * np.eye(2))
             information += eth
             weighted += eth @ picture @ self._eth_weighted
         if self._eih_place is not None:

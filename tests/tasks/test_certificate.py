@@ -1,0 +1,134 @@
+"""Every named task is certified over all its test scenarios, and means what the lock says."""
+
+import dataclasses
+import importlib.resources
+import json
+
+import pytest
+
+import hvs_suite
+from hvs_suite.cell.kinematics import kinematics
+from hvs_suite.datasets.expert import make_expert
+from hvs_suite.rollout import run_episode
+from hvs_suite.tasks import certificate, lock
+from hvs_suite.tasks.scenario import TEST_SCENARIOS
+
+# The lines that answer one of the four questions; each must stand in every certificate.
+QUESTIONS = ("reachable", "in time", "observable", "accurate", "solved")
+
+
+@pytest.mark.parametrize("task", hvs_suite.TASKS)
+def test_a_name_means_what_the_lock_says(task: str) -> None:
+    """If this fails, raise the task's version and run ``python -m hvs_suite.certify``."""
+    assert lock.compute_entry(hvs_suite.TASKS[task]) == lock.lock()[task]
+
+
+def test_the_lock_holds_exactly_the_named_tasks() -> None:
+    assert list(lock.lock()) == list(hvs_suite.TASKS)
+    digests = [lock.digest(task) for task in hvs_suite.TASKS]
+    assert len(set(digests)) == len(digests)
+    assert all(len(digest) == 64 for digest in digests)
+
+
+def test_changing_what_a_name_means_changes_its_digest() -> None:
+    variant = hvs_suite.TASKS["align-easy"]
+    entry = lock.compute_entry(variant)
+    for change in (
+        {"version": 2},
+        {"tilt_tolerance_deg": 4.9},
+        {"eth_fov_deg": 31.5},
+        {"observations": "eih"},
+    ):
+        changed = lock.compute_entry(dataclasses.replace(variant, **change))  # type: ignore[arg-type]
+        assert changed.digest != entry.digest, change
+    # What shapes no scene leaves the scenarios, and their digest, as they are.
+    tolerance = lock.compute_entry(dataclasses.replace(variant, tilt_tolerance_deg=4.9))
+    assert tolerance.test_scenarios == entry.test_scenarios
+
+
+@pytest.mark.parametrize("task", hvs_suite.TASKS)
+def test_the_stored_certificate_is_of_this_task_and_every_line_of_it_holds(task: str) -> None:
+    stored = certificate.load_certificate(task)
+    assert stored.task == task
+    assert stored.digest == lock.digest(task)
+    assert stored.scenarios == TEST_SCENARIOS
+    assert [check.what for check in stored.checks if not check.holds] == []
+    assert stored.holds
+    for question in QUESTIONS:
+        assert any(check.what.startswith(question) for check in stored.checks), question
+
+
+@pytest.mark.parametrize("task", hvs_suite.TASKS)
+def test_every_tolerance_has_a_line_that_names_the_source_of_the_information(task: str) -> None:
+    variant = hvs_suite.TASKS[task]
+    lines = [c.what for c in certificate.load_certificate(task).checks]
+    tolerances = {
+        "position": variant.position_tolerance_mm,
+        "lateral": variant.lateral_tolerance_mm,
+        "height": variant.height_tolerance_mm,
+        "tilt": variant.tilt_tolerance_deg,
+    }
+    for name, tolerance in tolerances.items():
+        found = [line for line in lines if line.startswith(f"accurate: {name} from ")]
+        assert len(found) == (0 if tolerance is None else 1)
+
+
+def test_certificates_are_of_the_named_tasks_alone() -> None:
+    folder = importlib.resources.files("hvs_suite.tasks") / "certificates"
+    names = {path.name for path in folder.iterdir()}
+    assert names == {f"{task}.json" for task in hvs_suite.TASKS}
+
+
+@pytest.mark.parametrize("n", [15, pytest.param(TEST_SCENARIOS, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("task", hvs_suite.TASKS)
+def test_the_certificate_holds_when_it_is_computed_anew(task: str, n: int) -> None:
+    with hvs_suite.load(task, split="test") as env:
+        checks = certificate.certify(env, range(n))
+    assert [(check.what, check.found) for check in checks if not check.holds] == []
+    if n == TEST_SCENARIOS:
+        stored = certificate.load_certificate(task).checks
+        assert [check.what for check in checks] == [check.what for check in stored][: len(checks)]
+
+
+@pytest.mark.parametrize("n", [4, pytest.param(TEST_SCENARIOS, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("task", hvs_suite.TASKS)
+def test_the_expert_solves_the_test_scenarios_without_a_collision(task: str, n: int) -> None:
+    with hvs_suite.load(task, split="test", observations="state") as env:
+        expert = make_expert(env)
+        episodes = [run_episode(env, expert, index) for index in range(n)]
+    assert [e.scenario for e in episodes if not e.success or e.collision] == []
+
+
+def test_a_check_that_fails_fails_the_certificate() -> None:
+    good = certificate.Check("reachable", "5 deg", ">= 2 deg", True)
+    bad = dataclasses.replace(good, found="1 deg", holds=False)
+    made = certificate.Certificate("align-easy", "0" * 64, 1000, (good, bad))
+    assert not made.holds
+    assert dataclasses.replace(made, checks=(good,)).holds
+    assert json.loads(made.to_json())["checks"][1]["holds"] is False
+    assert not certificate.solved_check(n_success=999, n_collision=0, n=1000, mean_steps=9.0).holds
+    assert not certificate.solved_check(n_success=1000, n_collision=1, n=1000, mean_steps=9.0).holds
+    assert certificate.solved_check(n_success=1000, n_collision=0, n=1000, mean_steps=9.0).holds
+
+
+def test_a_goal_beyond_the_arm_s_reach_would_be_noticed() -> None:
+    """The thesis's own target distribution, per coordinate, fails the first question."""
+    with hvs_suite.load(
+        "align-easy", split="test", observations="state", ring_m=(0.40, 1.10)
+    ) as env:
+        checks = certificate.check_geometry(env, range(20))
+    assert [check.holds for check in checks] == [False, False]
+    # |x| and |y| each in 0.40 to 0.78 m: radius 0.57 to 1.10 m.
+    reach = [
+        len(kinematics().goal_configurations_at_tool_angle([x, y, 0.05], [0, 0, 1.0], 0.0)) > 0
+        for x in (0.42, 0.5, 0.6, 0.7)
+        for y in (0.42, 0.5, 0.6, 0.7)
+    ]
+    assert sum(reach) / len(reach) < 0.6
+
+
+def test_a_target_too_small_to_see_would_be_noticed() -> None:
+    """The thesis's 1 cm disc at 112 px is under a pixel of eye to hand."""
+    with hvs_suite.load("align-thesis", split="test", target_diameter_m=0.010) as env:
+        footprint = certificate.check_visibility(env, range(20))[0]
+    assert not footprint.holds
