@@ -140,7 +140,7 @@ class Sight:
         middle = project(np.array([*place[0], height]), K, T)[:2]
         centre = blob.centre - (drawn_centre - middle)
         # The point and its neighbours one pixel to the right and below: place and derivative.
-        places = intersect(centre + [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], K, T, height)
+        places = intersect(np.add(centre, [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), K, T, height)
         if places is None:
             return None
         radius = float(np.hypot(*places[0]))
@@ -207,7 +207,7 @@ class TargetEstimate:
         return -self._lift_m
 
     def place(self) -> tuple[FloatArray, float]:
-        """x and y of the target (2,) in m and their largest standard deviation (m)."""
+        """Place in x and y of the target (2,) in m and their largest standard deviation (m)."""
         information, weighted = np.zeros((2, 2)), np.zeros(2)
         if self._eth_information.any():
             picture = np.linalg.inv(self._eth_information)
