@@ -37,10 +37,10 @@ from hvs_suite.cell.robot import (
 )
 from hvs_suite.datasets.expert import Expert
 from hvs_suite.errors import PolicyError
-from hvs_suite.policies.disc_detection import find_blobs
 from hvs_suite.policies.target_estimate import Sight, Sighting, TargetEstimate
 from hvs_suite.policies.target_search import SPACING_M, TargetSearch
 from hvs_suite.rollout import Observation
+from hvs_suite.tasks.detection import find_discs
 from hvs_suite.tasks.variants import AlignVariant, observation_names
 
 if TYPE_CHECKING:
@@ -88,9 +88,9 @@ class Belief:
 
     def __init__(self, variant: AlignVariant) -> None:
         self.variant = variant
-        self.joint_positions = np.zeros(7)
-        self.joint_velocities = np.zeros(7)
-        self._goal = np.zeros(3)
+        self.joint_positions: FloatArray = np.zeros(7)
+        self.joint_velocities: FloatArray = np.zeros(7)
+        self._goal: FloatArray = np.zeros(3)
         self.reset()
 
     def reset(self) -> None:
@@ -102,7 +102,8 @@ class Belief:
 
     def measure(self, positions: FloatArray, velocities: FloatArray) -> None:
         """Take in measured joint angles (7,) rad and speeds (7,) rad/s."""
-        self.joint_positions, self.joint_velocities = positions, velocities
+        self.joint_positions = positions
+        self.joint_velocities = velocities
         if self._start is None:
             self._start = positions
         if self._commands and not self._has_moved:
@@ -238,8 +239,8 @@ class Servo:
 
     def _sighting(self, image: npt.NDArray[Any], K: FloatArray, T: FloatArray) -> Sighting | None:
         """The first patch of a picture that can be the target."""
-        for blob in find_blobs(image):
-            sighting = self._sight.sighting(blob, K, T, self._estimate.surface_m)
+        for disc in find_discs(image):
+            sighting = self._sight.sighting(disc, K, T, self._estimate.surface_m)
             if sighting is not None:
                 return sighting
         return None

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from hvs_suite.cell.cameras import project
 from hvs_suite.cell.marker import HALF_THICKNESS_M
-from hvs_suite.policies.disc_detection import Blob
+from hvs_suite.tasks.detection import Disc
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -119,18 +119,18 @@ class Sight:
         self._ring_m = ring_m
 
     def sighting(
-        self, blob: Blob, K: FloatArray, T: FloatArray, surface_m: float
+        self, disc: Disc, K: FloatArray, T: FloatArray, surface_m: float
     ) -> Sighting | None:
         """Take a patch for the target, or None where it cannot be.
 
         Args:
-            blob: The patch.
+            disc: The patch.
             K: Intrinsics of the camera, (3, 3) px.
             T: Extrinsics as believed, (4, 4).
             surface_m: Height of the surface as believed (m).
         """
         height = surface_m + DISC_PLANE_M
-        place = intersect(blob.centre[None], K, T, height)
+        place = intersect(disc.centre[None], K, T, height)
         if place is None:
             return None
         expected = outline(place[0], self._diameter_m, K, T, height)
@@ -138,7 +138,7 @@ class Sight:
             return None
         area, drawn_centre = expected[0] * DRAWN_AREA, expected[1]
         middle = project(np.array([*place[0], height]), K, T)[:2]
-        centre = blob.centre - (drawn_centre - middle)
+        centre = disc.centre - (drawn_centre - middle)
         # The point and its neighbours one pixel to the right and below: place and derivative.
         places = intersect(np.add(centre, [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), K, T, height)
         if places is None:
@@ -147,11 +147,11 @@ class Sight:
         if not self._ring_m[0] - _RING_MARGIN_M <= radius <= self._ring_m[1] + _RING_MARGIN_M:
             return None
         slack = 4.0 + 0.5 * area
-        if blob.area > area + slack or (not blob.is_cut and blob.area < 0.15 * area):
+        if disc.area > area + slack or (not disc.is_cut and disc.area < 0.15 * area):
             return None
-        ratio = blob.area / area
-        is_whole = not blob.is_cut and blob.area > 0.85 * area
-        sigma = _CENTRE_PX + _CENTRE_SMALL_PX / np.sqrt(max(blob.area, 1.0))
+        ratio = disc.area / area
+        is_whole = not disc.is_cut and disc.area > 0.85 * area
+        sigma = _CENTRE_PX + _CENTRE_SMALL_PX / np.sqrt(max(disc.area, 1.0))
         if not is_whole:
             sigma += 0.5 * np.sqrt(area) * max(0.3, 1.0 - ratio)
         slope = (places[1:] - places[0]).T
@@ -184,7 +184,7 @@ class TargetEstimate:
         self._eth_information = np.zeros((2, 2))
         self._eth_weighted = np.zeros(2)
         self._eih_place: FloatArray | None = None
-        self._eih_covariance = np.zeros((2, 2))
+        self._eih_covariance: FloatArray = np.zeros((2, 2))
         self._outliers = 0
         self._lift_m = 0.0
         self._lift_variance = _HEIGHT_PRIOR_M**2

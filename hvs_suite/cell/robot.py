@@ -265,7 +265,7 @@ def robot_mjcf() -> str:
     return str(_robot_tree().to_xml_string())
 
 
-class Iiwa7(composer.Entity):  # type: ignore[misc]  # dm_control is untyped
+class Iiwa7(composer.Entity):
     """The arm as a composer entity; its model origin is the base frame.
 
     The gains are tuned for ``PHYSICS_TIMESTEP_S`` and ``implicitfast``: the model that it is
