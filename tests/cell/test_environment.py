@@ -13,6 +13,7 @@ from postures import posture_at
 
 import hvs_suite
 from hvs_suite.cell.environment import Environment
+from hvs_suite.cell.renderer import Renderer
 from hvs_suite.errors import ScenarioError
 
 Named = Callable[..., Environment]
@@ -170,6 +171,33 @@ def test_pictures_are_the_same_whether_the_renderer_is_young_or_old() -> None:
         a, b = young.reset(scenario=9).observation, old.reset(scenario=9).observation
         np.testing.assert_array_equal(a["eth"], b["eth"])
         np.testing.assert_array_equal(a["eih"], b["eih"])
+
+
+def test_a_reset_rebuilds_nothing_and_each_camera_is_drawn_once_a_step(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The thesis rebuilt its world at every reset, and converted pictures pixel by pixel."""
+    drawn: list[int] = []
+    colour = Renderer.colour
+
+    def count(self: Renderer, data: Any, camera: Any, height: int, width: int) -> Any:
+        drawn.append(camera)
+        return colour(self, data, camera, height, width)
+
+    monkeypatch.setattr(Renderer, "colour", count)
+    with hvs_suite.load("align-hard") as env:
+        env.reset(scenario=0)
+        model, data, renderer = env.physics.model.ptr, env.physics.data.ptr, env.renderer
+        cameras = [env.task.cameras[name].id for name in ("eih", "eth")]
+        assert drawn == cameras
+        for scenario in (1, 2):
+            drawn.clear()
+            env.reset(scenario=scenario)
+            assert env.physics.model.ptr is model
+            assert env.physics.data.ptr is data
+            assert env.renderer is renderer
+            env.step(wander(env, 0))
+            assert drawn == 2 * cameras
 
 
 @pytest.mark.parametrize("task", hvs_suite.TASKS)

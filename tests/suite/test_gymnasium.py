@@ -3,6 +3,7 @@
 import warnings
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
@@ -14,6 +15,8 @@ from hvs_suite.gym import AlignEnv
 TASKS = sorted(hvs_suite.TASKS)
 ERRORS = ("position_error_mm", "lateral_error_mm", "height_error_mm", "tilt_error_deg")
 HOLD = np.zeros(7, np.float32)
+# Python warns of every fork; that ours is safe after drawing is tested in test_renderer.py.
+may_fork = pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning")
 
 
 @pytest.fixture(scope="module")
@@ -21,6 +24,18 @@ def thesis():
     env = gymnasium.make("hvs_suite/align-thesis-v1", split="test", render_mode="rgb_array")
     yield env
     env.close()
+
+
+class WithPhysics(gymnasium.Wrapper):
+    """An environment that tells its physics state, which no observation shows in full."""
+
+    def physics_state(self):
+        """All that MuJoCo needs to go on from here, (n,) float64."""
+        physics = self.unwrapped.environment.physics
+        kind = mujoco.mjtState.mjSTATE_INTEGRATION
+        state = np.empty(mujoco.mj_stateSize(physics.model.ptr, kind))
+        mujoco.mj_getState(physics.model.ptr, physics.data.ptr, state, kind)
+        return state
 
 
 def same(first, second):
@@ -159,6 +174,12 @@ def test_unknown_scenarios_tasks_and_options_are_refused(thesis):
         AlignEnv("align-thesi")
     with pytest.raises(OptionError):
         gymnasium.make("hvs_suite/align-easy-v1", no_such_option=1)
+    with pytest.raises(gymnasium.error.NameNotFound, match="align-thesis"):
+        gymnasium.make("hvs_suite/align-thesi-v1")
+    with pytest.raises(OptionError, match="eih_resolution is 0 px"):
+        gymnasium.make("hvs_suite/align-easy-v1", eih_resolution=0)
+    with pytest.raises(OptionError, match="both cameras off"):
+        gymnasium.make("hvs_suite/align-easy-v1", observations="joint_positions")
     with pytest.raises(gymnasium.error.UnsupportedMode):
         AlignEnv("align-easy", render_mode="human")
 
@@ -195,6 +216,39 @@ def test_options_of_the_task_are_keywords():
     env.close()
 
 
+@may_fork
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("task", TASKS)
+def test_a_scenario_asked_for_by_index_is_the_same_in_any_worker(task):
+    """Whatever the worker played before, and bit for bit: pictures, joints and physics."""
+    workers = gymnasium.make_vec(
+        f"hvs_suite/{task}-v1",
+        num_envs=4,
+        vectorization_mode="async",
+        split="test",
+        wrappers=[WithPhysics],
+    )
+    alone = WithPhysics(AlignEnv(task, split="test"))
+    try:
+        workers.reset(seed=500)
+        workers.step(np.random.default_rng(0).uniform(-0.05, 0.05, (4, 7)).astype(np.float32))
+        expected, _ = alone.reset(options={"scenario": 23})
+        observations, info = workers.reset(options={"scenario": 23})
+        assert info["scenario"].tolist() == [23] * 4
+        for step in range(3):
+            state = alone.physics_state()
+            for i, found in enumerate(workers.call("physics_state")):
+                np.testing.assert_array_equal(found, state)
+                assert same(expected, {name: value[i] for name, value in observations.items()})
+            action = np.full((4, 7), 0.01 * step, np.float32)
+            expected, *_ = alone.step(action[0])
+            observations, *_ = workers.step(action)
+    finally:
+        workers.close()
+        alone.close()
+
+
+@may_fork
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("context", ["fork", "spawn"])
 def test_async_workers_play_the_scenarios_they_are_asked_for(thesis, context):

@@ -97,10 +97,12 @@ def test_an_option_that_makes_no_sense_is_refused_in_one_line(
 
 
 def test_a_control_period_has_to_be_a_whole_number_of_physics_steps() -> None:
-    with hvs_suite.load("align-thesis", observations="state", control_period_s=0.05) as env:
-        env.reset(scenario=0)
-        env.step(np.zeros(7))
-        assert env.physics.data.time == pytest.approx(0.05)
+    for period in (0.05, 0.2):
+        with hvs_suite.load("align-thesis", observations="state", control_period_s=period) as env:
+            env.reset(scenario=0)
+            env.step(np.zeros(7))
+            assert env.physics.data.time == pytest.approx(period)
+            assert env.control_timestep() == period
     with pytest.raises(OptionError, match="control_period_s"):
         hvs_suite.load("align-thesis", control_period_s=0.0033)
 

@@ -1,6 +1,7 @@
 """Scenarios are a pure function of task, version, scene options, split and index."""
 
 import dataclasses
+import random
 from collections.abc import Callable
 from typing import Any
 
@@ -145,8 +146,9 @@ def test_a_seed_plays_the_scenario_of_that_number() -> None:
         assert env.info["scenario"] == 2**40 + 3
 
 
-def test_workers_seeded_in_a_row_share_no_scenes() -> None:
-    train, test = source("align-thesis", "train"), source("align-thesis", "test")
+@pytest.mark.parametrize("task", hvs_suite.TASKS)
+def test_workers_seeded_in_a_row_share_no_scenes(task: str) -> None:
+    train, test = source(task, "train"), source(task, "test")
     # Sixteen workers, a thousand resets each.
     streams = [{train.seeded_index(100 + w, n) for n in range(1000)} for w in range(16)]
     assert len(set.union(*streams)) == 16 * 1000
@@ -154,6 +156,23 @@ def test_workers_seeded_in_a_row_share_no_scenes() -> None:
     streams = [{test.seeded_index(100 + w, n) for n in range(27)} for w in range(36)]
     assert len(set.union(*streams)) == 36 * 27
     assert {test.seeded_index(5, n) for n in range(1000)} == set(range(1000))
+
+
+def test_global_random_state_is_neither_read_nor_moved() -> None:
+    """The thesis drew everything from the global generators, and training and evaluation alike."""
+    seen = []
+    for seed in (0, 1):
+        random.seed(seed)
+        np.random.seed(seed)  # noqa: NPY002 - the global state is what this is about
+        before = (random.getstate(), str(np.random.get_state()))  # noqa: NPY002
+        with hvs_suite.load("align-drill", split="test", seed=3) as env:
+            first = env.reset().observation
+            env.step(env.commandable(env.scenario.start))
+            seen.append((first, env.scenario.digest(), env.task.source.seeded_index(3, 1)))
+        assert (random.getstate(), str(np.random.get_state())) == before  # noqa: NPY002
+    for name, value in seen[0][0].items():
+        np.testing.assert_array_equal(value, seen[1][0][name])
+    assert seen[0][1:] == seen[1][1:]
 
 
 @pytest.mark.parametrize("task", ["align-easy", "align-thesis", "align-hard"])
