@@ -8,9 +8,9 @@ from hvs_suite.policies import imported
 from hvs_suite.rollout import PolicyFactory
 from hvs_suite.tasks.variants import TASKS
 
-BUILTIN = ("expert", "zero", "random")
+BUILTIN = ("expert", "servo", "zero", "random")
 SHIPPED = ("pretrained", "finetuned")
-NAMES = (*BUILTIN, "servo", *SHIPPED)
+NAMES = (*BUILTIN, *SHIPPED)
 HERE = Path(__file__).resolve().parent
 
 
@@ -18,7 +18,7 @@ def policy_factory(spec: str, task: str) -> PolicyFactory:
     """Find a policy for a task.
 
     Args:
-        spec: ``expert``, ``zero``, ``random``, ``servo``, ``pretrained``, ``finetuned`` (the
+        spec: ``expert``, ``servo``, ``zero``, ``random``, ``pretrained``, ``finetuned`` (the
             weights shipped for the task), a checkpoint folder, or ``module:factory`` for code of
             one's own, which is imported and run (see `hvs_suite.policies.imported`).
         task: Named task.
@@ -35,8 +35,6 @@ def policy_factory(spec: str, task: str) -> PolicyFactory:
         raise UnknownTaskError(f"unknown task {task!r}; did you mean {' or '.join(close)}?")
     if spec in BUILTIN:
         return _builtin(spec)
-    if spec == "servo":
-        raise PolicyError("this version has no servo policy; try expert or a checkpoint folder")
     if spec in SHIPPED:
         folder = HERE / spec / task
         if not folder.is_dir():
@@ -63,6 +61,10 @@ def _builtin(name: str) -> PolicyFactory:
         from hvs_suite.datasets.expert import make_expert
 
         return make_expert
+    if name == "servo":
+        from hvs_suite.policies.servo import make_servo
+
+        return make_servo
     from hvs_suite.policies import builtin
 
     return builtin.make_zero if name == "zero" else builtin.make_random

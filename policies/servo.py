@@ -15,7 +15,8 @@ A decision is:
    certain. While nobody has seen it, hover over the nearest part of the surface that nobody has
    looked at.
 4. Move there the fastest way within joint limits and clear of collisions: the expert's motion,
-   started from what is believed instead of from what is true.
+   started from what is believed instead of from what is true. Hovering, prefer postures from
+   which the way on to the goal is short: others end at a joint's stop and have to turn back.
 """
 
 from __future__ import annotations
@@ -59,10 +60,13 @@ _MAX_MISSES = 6
 _MAX_LATENCY = 3
 _MOVED_SHARE = 0.1
 """A first move of less than this share of the commanded one is still to come."""
-_REACH_MARGIN_M = 0.002
+_REACH_MARGIN_M = 0.0005
 _SHORTEST_REACH_M = 0.402
 """Least distance of wrist and shoulder, A4 at its limit of 120 deg."""
 _LOOK_CHOICES = 12
+_N_DESCENT_SWIVEL = 36
+_DESCENT_SLACK_S = 0.2
+"""A hover whose way on takes this much longer than the shortest way on is not chosen."""
 
 
 class Playground(Protocol):
@@ -84,17 +88,20 @@ class Belief:
         variant: The task's parameters.
         joint_positions: Measured, (7,) rad.
         joint_velocities: Measured, (7,) rad/s.
+        descent: Where the flange goes next from the goal, (3,) m, where it only hovers there.
     """
 
     def __init__(self, variant: AlignVariant) -> None:
         self.variant = variant
         self.joint_positions: FloatArray = np.zeros(7)
         self.joint_velocities: FloatArray = np.zeros(7)
+        self.descent: FloatArray | None = None
         self._goal: FloatArray = np.zeros(3)
         self.reset()
 
     def reset(self) -> None:
         """Forget the last episode."""
+        self.descent = None
         self._start: FloatArray | None = None
         self._commands: list[FloatArray] = []
         self._latency = 0
@@ -115,9 +122,13 @@ class Belief:
             else:
                 self._latency = min(len(self._commands), _MAX_LATENCY)
 
-    def aim(self, goal: FloatArray) -> None:
-        """Set the goal of the flange, (3,) m; it faces straight down."""
+    def aim(self, goal: FloatArray, descent: FloatArray | None = None) -> None:
+        """Set the goal of the flange and, for a hover, where it goes next, (3,) m.
+
+        It faces straight down at both.
+        """
         self._goal = goal
+        self.descent = descent
 
     def command(self, action: npt.NDArray[np.float32]) -> None:
         """Remember an action, (7,) in [-1, 1]."""
@@ -150,6 +161,37 @@ class Belief:
         return set_point
 
 
+class Mover(Expert):
+    """The expert's motion, which thinks one goal ahead while it hovers.
+
+    Args:
+        belief: What it knows of the arm.
+    """
+
+    def __init__(self, belief: Belief) -> None:
+        super().__init__(cast("Environment", belief))
+        self._belief = belief
+
+    def _ranked_goals(
+        self, q: FloatArray, velocity: FloatArray, position: FloatArray, normal: FloatArray
+    ) -> FloatArray:
+        """Hover configurations (m, 7), the one reached soonest first, that have a short way on."""
+        ranked = super()._ranked_goals(q, velocity, position, normal)
+        if self._belief.descent is None or len(ranked) == 0:
+            return ranked
+        onward = self._kinematics.goal_configurations_at_tool_angle(
+            self._belief.descent, _UP, ranked[0, 6], n_swivel=_N_DESCENT_SWIVEL
+        )
+        if len(onward) == 0:
+            return ranked
+        seconds = np.zeros((len(ranked), len(onward)), np.float32)
+        for here, there, speed in zip(ranked.T, onward.T, JOINT_SPEED_RAD_S, strict=True):
+            way = np.subtract.outer(here.astype(np.float32), there.astype(np.float32))
+            np.maximum(seconds, np.abs(way) / np.float32(speed), out=seconds)
+        descent = seconds.min(axis=1)
+        return np.asarray(ranked[descent <= descent.min() + _DESCENT_SLACK_S])
+
+
 class Servo:
     """The policy; follows :class:`hvs_suite.rollout.Policy`.
 
@@ -165,7 +207,7 @@ class Servo:
         self._variant = variant
         self._kinematics = kinematics()
         self._belief = Belief(variant)
-        self._mover = Expert(cast("Environment", self._belief))
+        self._mover = Mover(self._belief)
         self._sight = Sight(variant.target_diameter_m, variant.ring_m)
         self._search = TargetSearch(self._kinematics, variant.ring_m, variant.target_diameter_m)
         names = observation_names(variant.observations)
@@ -202,7 +244,7 @@ class Servo:
         q = np.asarray(observation["joint_positions"], np.float64)
         self._belief.measure(q, np.asarray(observation["joint_velocities"], np.float64))
         self._perceive(observation, q)
-        self._belief.aim(self._goal(q))
+        self._aim(q)
         action = self._mover.label()
         self._belief.command(action)
         return action
@@ -261,18 +303,25 @@ class Servo:
 
     # --- going ----------------------------------------------------------------------------------
 
-    def _goal(self, q: FloatArray) -> FloatArray:
-        """Where the flange shall go, (3,) m."""
+    def _aim(self, q: FloatArray) -> None:
+        """Decide where the flange shall go."""
         if not self._estimate.is_known:
-            return self._look_out(q)
+            self._belief.aim(self._look_out(q))
+            return
         place, sigma = self._estimate.place()
-        standoff = self._variant.standoff_m
-        height = standoff
+        standoff, surface = self._variant.standoff_m, self._estimate.surface_m
+        # Misplaced by a few millimetres, a target at the edge would be out of reach.
+        goal = _within_reach(np.array([*place, standoff + surface]))
+        needed = 0.0
         if self._has_eih:
-            needed = 0.5 * self._variant.target_diameter_m + _SIGMAS * sigma
-            height = max(standoff, needed / self._half_view) * (1.0 + 0.3 * self._misses)
-        goal = np.array([*place, min(height, _MAX_HOVER_M) + self._estimate.surface_m])
-        return goal if height == standoff else _within_reach(goal)
+            radius = 0.5 * self._variant.target_diameter_m + _SIGMAS * sigma
+            needed = radius / self._half_view
+        height = max(standoff, needed) * (1.0 + 0.3 * self._misses)
+        if height == standoff:
+            self._belief.aim(goal)
+            return
+        hover = np.array([*place, min(height, _MAX_HOVER_M) + surface])
+        self._belief.aim(_within_reach(hover), descent=goal)
 
     def _look_out(self, q: FloatArray) -> FloatArray:
         """Where to hover to look at what nobody has looked at, (3,) m.

@@ -53,7 +53,7 @@ def test_random_starts_again_with_each_episode():
     np.testing.assert_array_equal(first, [policy.select_action({}) for _ in range(3)])
 
 
-@pytest.mark.parametrize("spec", ["expert", "zero", "random"])
+@pytest.mark.parametrize("spec", ["expert", "servo", "zero", "random"])
 def test_factories_travel_to_workers(spec):
     factory = policy_factory(spec, "align-easy")
     assert pickle.loads(pickle.dumps(factory)) == factory  # noqa: S301 - our own bytes
@@ -71,7 +71,7 @@ def test_a_checkpoint_travels_to_workers_and_plays(checkpoint, named):
     env.step(action)
 
 
-@pytest.mark.parametrize("spec", ["servo", "pretrained", "finetuned", "exprt", "no/such/folder"])
+@pytest.mark.parametrize("spec", ["pretrained", "finetuned", "exprt", "no/such/folder"])
 def test_what_does_not_exist_says_so_in_one_line(spec):
     with pytest.raises(PolicyError) as error:
         policy_factory(spec, "align-limit")
