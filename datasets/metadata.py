@@ -24,6 +24,8 @@ class DatasetMetadata:
         options: Options of the task that differ from the named one.
         noise: Standard deviation of the perturbation of executed actions, far from the goal (rad).
         command: What recorded it, for people.
+        task_digest: What the task's name meant then, as ``hvs_suite.tasks.lock`` says it; empty in
+            datasets from before it was kept.
         format: Version of this file.
     """
 
@@ -33,11 +35,15 @@ class DatasetMetadata:
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     noise: float = 0.0
     command: str = ""
+    task_digest: str = ""
     format: int = FORMAT
 
     def same_recording(self, other: "DatasetMetadata") -> bool:
         """Whether both describe the same demonstrations, whatever command asked for them."""
-        return dataclasses.replace(self, command="") == dataclasses.replace(other, command="")
+        own, others = self, other
+        if not (self.task_digest and other.task_digest):
+            own, others = (dataclasses.replace(each, task_digest="") for each in (self, other))
+        return dataclasses.replace(own, command="") == dataclasses.replace(others, command="")
 
 
 def write_metadata(root: Path, metadata: DatasetMetadata) -> None:
@@ -75,6 +81,7 @@ def read_metadata(root: str | Path) -> DatasetMetadata:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise DatasetError(f"{path} has another format than {FORMAT}; update hvs-suite")
     names = {field.name for field in dataclasses.fields(DatasetMetadata)}
+    content.setdefault("task_digest", "")
     try:
         return DatasetMetadata(**{name: content[name] for name in names})
     except KeyError as error:

@@ -24,6 +24,7 @@ from hvs_suite.datasets.metadata import (
 from hvs_suite.errors import DatasetError, HvsError, OptionError, OutputError, ScenarioError
 from hvs_suite.registry import find
 from hvs_suite.rollout import play
+from hvs_suite.tasks.lock import digest
 from hvs_suite.tasks.variants import with_options
 
 BLOCK_EPISODES = 50
@@ -104,6 +105,7 @@ def record(
         options=jsonable(options or {}),
         noise=float(noise),
         command=command,
+        task_digest=digest(task),
     )
     # PyArrow and the simulator load only once the arguments have passed.
     from hvs_suite.datasets.demonstration import Demonstrate, MakeEnvironment

@@ -24,6 +24,7 @@ COMMANDS = {
     "show": "hvs_suite.cli.show:Show",
     "view": "hvs_suite.cli.view:View",
     "record": "hvs_suite.cli.record:Record",
+    "check": "hvs_suite.cli.check:Check",
     "pretrain": "hvs_suite.cli.pretrain:Pretrain",
     "evaluate": "hvs_suite.cli.evaluate:Evaluate",
     "verify": "hvs_suite.cli.verify:Verify",
