@@ -1,10 +1,10 @@
-"""Finds policies by name: the expert, the floor, shipped weights, a checkpoint, one's own code."""
+"""Finds policies by name: baselines, shipped weights, a checkpoint here or on the Hub, own code."""
 
 import difflib
 from pathlib import Path
 
 from hvs_suite.errors import PolicyError, UnknownTaskError
-from hvs_suite.policies import imported
+from hvs_suite.policies import hub, imported
 from hvs_suite.rollout import PolicyFactory
 from hvs_suite.tasks.variants import TASKS
 
@@ -19,8 +19,9 @@ def policy_factory(spec: str, task: str) -> PolicyFactory:
 
     Args:
         spec: ``expert``, ``servo``, ``zero``, ``random``, ``pretrained``, ``finetuned`` (the
-            weights shipped for the task), a checkpoint folder, or ``module:factory`` for code of
-            one's own, which is imported and run (see `hvs_suite.policies.imported`).
+            weights shipped for the task), a checkpoint folder, a checkpoint's Hub id
+            (``owner/name``), or ``module:factory`` for code of one's own, which is imported and run
+            (see `hvs_suite.policies.imported`).
         task: Named task.
 
     Returns:
@@ -45,15 +46,17 @@ def policy_factory(spec: str, task: str) -> PolicyFactory:
     folder = Path(spec)
     if imported.NAME.fullmatch(spec):
         return imported.imported_factory(spec)
-    if not folder.is_dir():
-        close = difflib.get_close_matches(spec, NAMES, n=1)
-        hint = (
-            f"did you mean {close[0]}?"
-            if close
-            else f"use {', '.join(NAMES)}, a folder, or module:factory for code of your own"
-        )
-        raise PolicyError(f"{spec!r} is neither a policy nor a checkpoint folder; {hint}")
-    return _checkpoint(folder, task)
+    if folder.is_dir():
+        return _checkpoint(folder, task)
+    if hub.NAME.fullmatch(spec):
+        return _checkpoint(hub.fetch(spec), task)
+    close = difflib.get_close_matches(spec, NAMES, n=1)
+    hint = (
+        f"did you mean {close[0]}?"
+        if close
+        else f"use {', '.join(NAMES)}, a folder, a Hub id such as owner/name, or module:factory"
+    )
+    raise PolicyError(f"{spec!r} is neither a policy nor a checkpoint folder; {hint}")
 
 
 def _builtin(name: str) -> PolicyFactory:
