@@ -57,6 +57,27 @@ def test_each_term_switches_alone() -> None:
     assert everything == {name: pytest.approx(value) for name, value in values.items()}
 
 
+@pytest.mark.parametrize(
+    ("further", "on_the_way"),
+    [
+        ((), 0.0),
+        (("rotation",), 0.4 * 139.0 / 179.0),
+        (("position",), 0.4 * 1.259 / 1.559),
+        (("position", "rotation"), 0.4 * (1.259 / 1.559 + 139.0 / 179.0)),
+        (("time",), -0.05),
+        (("time", "position", "rotation"), 0.4 * (1.259 / 1.559 + 139.0 / 179.0) - 0.05),
+    ],
+)
+def test_the_thesis_s_six_sets_are_there(
+    further: tuple[RewardTerm, ...], on_the_way: float
+) -> None:
+    """D.4: goal and collision alone, and with each of five additions."""
+    chosen = variant("goal", "collision", *further)
+    assert sum(reward_terms(chosen, ON_THE_WAY).values()) == pytest.approx(on_the_way)
+    assert sum(reward_terms(chosen, outcome(success=True)).values()) == 1.0
+    assert sum(reward_terms(chosen, outcome(collision=True)).values()) == -1.0
+
+
 def test_collision_replaces_everything_and_the_goal_every_shaping() -> None:
     assert reward_terms(variant(*ALL), outcome(collision=True, success=True)) == {"collision": -1.0}
     assert reward_terms(variant(*ALL), outcome(success=True)) == {"goal": 1.0}

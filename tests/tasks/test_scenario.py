@@ -194,6 +194,13 @@ def test_targets_are_uniform_in_area_on_the_ring(task: str) -> None:
         assert len(kinematics().goal_configurations_at_tool_angle(goal, [0, 0, 1.0], 0.0))
 
 
+def test_the_ring_bounds_where_targets_lie() -> None:
+    draws = source("align-thesis", ring_m=(0.60, 0.65))
+    radius = np.hypot(*np.array([draws.draw(index).target[:2] for index in range(200)]).T)
+    assert 0.60 <= radius.min() < 0.605
+    assert 0.645 < radius.max() <= 0.65
+
+
 def test_fixed_places_are_ten_and_taken_by_index() -> None:
     draws, places = source("align-fixed"), fixed_places(0.40, 0.78)
     assert len(set(places)) == 10
