@@ -229,7 +229,8 @@ def _check_same_recording(root: Path, metadata: DatasetMetadata) -> None:
         OutputError: The folder holds something that is no recording.
         DatasetError: It holds another recording.
     """
-    if not root.is_dir() or not any(root.iterdir()):
+    # A recorder that was killed at once may leave a hidden file of its own, and nothing else.
+    if not root.is_dir() or all(entry.name.startswith(".") for entry in root.iterdir()):
         return
     if not (root / METADATA_FILE).exists():
         raise OutputError(f"{root} holds no recording to resume; choose another folder")
@@ -238,10 +239,10 @@ def _check_same_recording(root: Path, metadata: DatasetMetadata) -> None:
         names = [
             field.name
             for field in dataclasses.fields(metadata)
-            if field.name != "command"
+            if field.name not in ("command", "task_digest")
             and getattr(found, field.name) != getattr(metadata, field.name)
         ]
         raise DatasetError(
-            f"{root} was recorded with another {', '.join(names)}; resume with the same, or "
-            "choose another folder"
+            f"{root} was recorded with another {', '.join(names) or 'meaning of the task'}; resume "
+            "with the same, or choose another folder"
         )

@@ -1,0 +1,79 @@
+"""``hvs replay``: an episode of a dataset as a film."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from hvs_suite.cli.main import run
+from hvs_suite.datasets import replay as film
+from hvs_suite.datasets.reader import decode
+from hvs_suite.pictures import resize
+
+SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "align-thesis"
+DATA = "data/chunk-000/file-000.parquet"
+
+
+@pytest.fixture(scope="module")
+def played():
+    return film.replay(SAMPLE, 1)
+
+
+def rows():
+    table = pq.read_table(SAMPLE / DATA)
+    return [row for row in table.to_pylist() if row["episode_index"] == 1]
+
+
+def test_has_a_frame_for_each_step_and_one_for_the_end(played):
+    assert len(played.frames) == len(rows()) + 1
+    assert {frame.shape for frame in played.frames} == {(film.HEIGHT, film.WIDTH, 3)}
+    assert (played.scenario, played.success, played.fps) == (1, True, 10.0)
+
+
+def test_shows_the_pictures_of_the_dataset(played):
+    left = film.MARGIN + film.CELL_SIDE + film.MARGIN
+    top = film.HEAD + 2 * film.CAMERA_TITLE + film.CAMERA_SIDE
+    side = film.CAMERA_SIDE
+    for step in (0, 4):
+        shown = played.frames[step][top : top + side, left : left + side]
+        stored = decode(rows()[step]["observation.images.eth"])
+        np.testing.assert_array_equal(shown, resize(stored, side))
+
+
+def test_curves_move_on(played):
+    curves = [frame[film.HEAD + film.CELL_SIDE :] for frame in played.frames]
+    assert (curves[0] != curves[1]).any()
+
+
+@pytest.mark.parametrize("suffix", ["gif", "mp4"])
+def test_command_writes_a_film(suffix, tmp_path, monkeypatch, played, capsys):
+    import imageio.v3 as iio
+
+    monkeypatch.setattr(film, "replay", lambda *_: played)
+    out = tmp_path / f"episode.{suffix}"
+    assert run(["replay", str(SAMPLE), "--episode", "1", "--out", str(out)]) == 0
+    assert "success" in capsys.readouterr().out
+    frames = iio.imread(out, plugin="pyav" if suffix == "mp4" else "pillow")
+    assert len(frames) == len(played.frames)
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["{sample}", "--episode", "5", "--out", "{folder}/a.gif"], "episodes 0 to 4"),
+        (["{folder}", "--episode", "0", "--out", "{folder}/a.gif"], "hvs.json"),
+        (["{sample}", "--episode", "0", "--out", "{folder}/a.avi"], ".mp4"),
+        (["{cut}", "--episode", "0", "--out", "{folder}/a.gif"], "cannot be read"),
+    ],
+)
+def test_what_cannot_be_filmed_is_refused_in_one_line(words, reason, tmp_path, capsys):
+    cut = tmp_path / "cut"
+    shutil.copytree(SAMPLE, cut)
+    (cut / DATA).write_bytes((cut / DATA).read_bytes()[:1000])
+    places = {"sample": SAMPLE, "folder": tmp_path, "cut": cut}
+    assert run(["replay", *(word.format(**places) for word in words)]) == 2
+    err = capsys.readouterr().err
+    assert reason in err
+    assert err.count("\n") == 1
