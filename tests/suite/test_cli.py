@@ -117,6 +117,62 @@ def test_bad_input_is_refused_in_one_line_that_says_why(words, reason, tmp_path,
     assert reason in refusal(capsys, *(word.format(**places) for word in words))
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "show align-easy --out {}/picture.png",
+        "view align-easy --out {}/film.gif",
+        "record --task align-easy --episodes 1 --out {}/data",
+        "evaluate --policy zero --task align-easy --episodes 1 --out {}/result.json",
+        "pretrain --data {data} --steps 1 --out {}/policy",
+        "leaderboard --results {results} --out {}",
+        "demo --out {}/demo",
+    ],
+    ids=lambda words: words.split()[0],
+)
+def test_a_folder_that_cannot_be_written_is_refused_in_one_line(words, tmp_path, capsys):
+    # A file where a folder has to be stops root as well, which modes would not.
+    blocked = tmp_path / "file"
+    blocked.touch()
+    places = {"data": tmp_path / "data", "results": tmp_path / "results"}
+    if "{data}" in words:
+        from hvs_suite.datasets.recorder import record
+
+        record("align-easy", 1, "train", places["data"], {"time_limit_steps": 2})
+    if "{results}" in words:
+        out = places["results"] / "zero" / "align-easy.json"
+        evaluate = "evaluate --policy zero --task align-easy --episodes 1 --out"
+        assert run([*evaluate.split(), str(out)]) == 0
+        capsys.readouterr()
+    assert str(blocked) in refusal(capsys, *words.format(blocked, **places).split())
+    assert blocked.read_bytes() == b""
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "show align-easy --out {}/picture.png",
+        "view align-easy --out {}/film.gif",
+        "bench --task align-easy --seconds 0.1",
+        "record --task align-easy --episodes 1 --out {}/data",
+        "evaluate --policy zero --task align-easy --episodes 1 --out {}/result.json",
+    ],
+    ids=lambda words: words.split()[0],
+)
+def test_without_an_opengl_library_the_one_line_names_the_package(
+    words, tmp_path, capsys, monkeypatch
+):
+    # Set first, so that the old value comes back although the choice of a backend writes it.
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    monkeypatch.delenv("MUJOCO_GL")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setattr("ctypes.util.find_library", lambda _name: None)
+    line = refusal(capsys, *words.format(tmp_path).split())
+    assert "apt-get install libegl1" in line
+    assert "hvs doctor" in line
+    assert not list(tmp_path.glob("*.*"))
+
+
 def test_view_without_a_display_asks_for_a_file(monkeypatch, capsys):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)

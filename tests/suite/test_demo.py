@@ -1,6 +1,9 @@
 """``hvs demo``: what a newcomer gets is real, and plain LeRobot reads it."""
 
 import json
+import re
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -40,6 +43,21 @@ def test_demo_scores_that_policy_as_it_is(demo):
     assert result["summary"]["task"] == "align-easy"
     assert result["summary"]["n_episodes"] == EVALUATIONS
     assert len(result["episodes"]) == EVALUATIONS
+
+
+@pytest.mark.timeout(300)
+def test_lerobot_eval_plays_the_policy_with_the_words_of_the_readme(demo, tmp_path, monkeypatch):
+    from lerobot.scripts import lerobot_eval
+
+    text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    [words] = re.findall(r"^lerobot-eval ((?:.*\\\n)*.*)$", text, re.MULTILINE)
+    words = words.replace("runs/demo/policy", str(demo / "policy")).replace("\\\n", " ")
+    monkeypatch.setattr("sys.argv", ["lerobot-eval", *words.split(), f"--output_dir={tmp_path}"])
+    # The same line again, short: the parser takes the last word on a subject.
+    sys.argv += ["--eval.n_episodes=1", "--env.episode_length=4"]
+    lerobot_eval.main()
+    result = json.loads((tmp_path / "eval_info.json").read_text())
+    assert result["overall"]["n_episodes"] == 1
 
 
 def test_demo_builds_a_board_with_a_row_for_its_policy(demo):

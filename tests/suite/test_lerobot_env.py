@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import hvs_suite
-from hvs_suite.errors import OptionError, UnknownTaskError
+from hvs_suite.errors import ActionError, OptionError, ScenarioError, UnknownTaskError
 
 pytest.importorskip("lerobot")
 # Importing LeRobot takes seconds, and half a minute on a busy machine.
@@ -89,6 +89,17 @@ def test_every_step_says_whether_it_succeeded(vector):
         assert info["is_success"].tolist() == [False, False]
 
 
+def test_actions_out_of_range_are_clipped_and_counted_and_nonsense_is_refused(vector):
+    vector.reset(seed=0)
+    action = np.zeros((2, 7), np.float32)
+    action[1, 3] = -1.5
+    assert vector.step(action)[4]["n_clipped"].tolist() == [0, 1]
+    assert vector.step(action)[4]["n_clipped"].tolist() == [0, 2]
+    action[1, 3] = np.nan
+    with pytest.raises(ActionError, match=r"action\[3\] is nan"):
+        vector.step(action)
+
+
 def test_async_environments_work_in_processes_without_lerobot(package):
     vector = package.HvsEnvConfig(task="align-easy").create_envs(2, use_async_envs=True)["hvs"][0]
     try:
@@ -118,6 +129,12 @@ def test_what_lerobot_cannot_take_is_refused(package):
         package.HvsEnvConfig(options={"eih_channels": 1})
     with pytest.raises(OptionError):
         package.HvsEnvConfig(options={"normalise_observation": True})
+    with pytest.raises(OptionError, match="eth_resolution is 0 px"):
+        package.HvsEnvConfig(options={"eth_resolution": 0})
+    with pytest.raises(OptionError, match="both cameras off"):
+        package.HvsEnvConfig(options={"observations": "joint_positions"})
+    with pytest.raises(ScenarioError):
+        package.HvsEnvConfig(split="").create_envs(1)
 
 
 @pytest.mark.timeout(600)
