@@ -3,10 +3,10 @@
 import difflib
 from pathlib import Path
 
-from hvs_suite.errors import PolicyError, UnknownTaskError
+from hvs_suite.errors import PolicyError
 from hvs_suite.policies import hub, imported
+from hvs_suite.registry import find
 from hvs_suite.rollout import PolicyFactory
-from hvs_suite.tasks.variants import TASKS
 
 BUILTIN = ("expert", "servo", "zero", "random")
 SHIPPED = ("pretrained", "finetuned")
@@ -31,9 +31,7 @@ def policy_factory(spec: str, task: str) -> PolicyFactory:
         PolicyError: There is no such policy, it cannot be loaded, or it does not fit the task.
         UnknownTaskError: There is no such task.
     """
-    if task not in TASKS:
-        close = difflib.get_close_matches(task, TASKS, n=2) or list(TASKS)
-        raise UnknownTaskError(f"unknown task {task!r}; did you mean {' or '.join(close)}?")
+    find(task)
     if spec in BUILTIN:
         return _builtin(spec)
     if spec in SHIPPED:
@@ -79,5 +77,5 @@ def _checkpoint(folder: Path, task: str) -> PolicyFactory:
         from hvs_suite.policies import checkpoint
     except ImportError as error:
         raise PolicyError(f"playing {folder} needs torch; install hvs-suite[learn]") from error
-    checkpoint.check_fit(checkpoint.read_config(folder), folder, TASKS[task])
+    checkpoint.check_fit(checkpoint.read_config(folder), folder, find(task))
     return checkpoint.CheckpointFactory(str(folder.resolve()))

@@ -1,0 +1,72 @@
+"""What the README shows works: its programs run, its tables and commands are true."""
+
+import re
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+import hvs_suite
+from hvs_suite.cli.main import COMMANDS
+
+ROOT = Path(__file__).parents[2]
+TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def table(first):
+    """Rows of the table whose head begins with a word, marks removed."""
+    lines = TEXT[TEXT.index(f"| {first} |") :].split("\n\n")[0].splitlines()
+    return [[cell.strip(" `") for cell in line.strip()[1:-1].split("|")] for line in lines[2:]]
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning")
+def test_the_programs_run(capsys):
+    first, second = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
+    exec(first, {"my_policy": lambda observation: np.zeros(7)})
+    assert "'scenario': 7" in capsys.readouterr().out
+    names = {}
+    exec(second, names)
+    assert isinstance(names["envs"], gymnasium.vector.AsyncVectorEnv)
+    assert names["env"].reset(seed=0)[1]["split"] == "train"
+    for env in (names["env"], names["envs"]):
+        env.close()
+
+
+def test_the_table_of_tasks_is_true():
+    rows = {row[0]: row for row in table("task")}
+    assert list(rows) == list(hvs_suite.TASKS)
+    for task, variant in hvs_suite.TASKS.items():
+        _, start, target, tolerance, held, steps, _ = rows[task]
+        assert start == variant.start
+        assert f"{1000 * variant.target_diameter_m:g} mm disc" in target
+        assert (int(held), int(steps)) == (variant.hold_steps, variant.time_limit_steps)
+        bounds = [
+            variant.position_tolerance_mm,
+            variant.lateral_tolerance_mm,
+            variant.height_tolerance_mm,
+            variant.tilt_tolerance_deg,
+        ]
+        numbers = [float(number) for number in re.findall(r"[\d.]+", tolerance)]
+        assert numbers == [bound for bound in bounds if bound is not None]
+
+
+def test_every_command_that_is_named_exists():
+    # Where code begins with it: prose that only mentions the suite does not count.
+    named = set(re.findall(r"(?:`|^|/)hvs ([a-z-]+)", TEXT, re.MULTILINE))
+    assert len(named) > 8
+    assert sorted(named - set(COMMANDS)) == []
+
+
+def test_every_target_of_make_that_is_named_exists():
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE))
+    named = set(re.findall(r"(?:`|^)make ([a-z-]+)", TEXT, re.MULTILINE))
+    assert {"demo", "test"} <= named <= targets
+
+
+def test_every_file_that_is_linked_exists():
+    links = re.findall(r"\]\(([^)#]+)\)", TEXT)
+    local = [link for link in links if not link.startswith("http")]
+    assert local
+    assert [link for link in local if not (ROOT / link).exists()] == []
