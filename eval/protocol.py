@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from hvs_suite import files, registry, rollout
-from hvs_suite.errors import OptionError, ScenarioError
+from hvs_suite.errors import OptionError, PolicyError, ScenarioError
 from hvs_suite.eval import action_log, progress_file, provenance, result_file
 from hvs_suite.eval.trial import PlayTrial, Trial, tolerances
 from hvs_suite.policies.catalogue import policy_factory
@@ -112,6 +112,22 @@ def find(policy: str, task: str) -> Contender:
     )
 
 
+def check_public(policy: str) -> None:
+    """Checks that a policy makes do with what a task shows.
+
+    Args:
+        policy: As `policy_factory` takes it.
+
+    Raises:
+        PolicyError: It looks behind the observations.
+    """
+    if policy in PRIVILEGED:
+        raise PolicyError(
+            f"{policy} looks behind the observations, which do not travel; evaluate it without a "
+            "server"
+        )
+
+
 def evaluate(
     policy: str | Contender,
     task: str,
@@ -149,7 +165,7 @@ def evaluate(
         OptionError: `episodes` or `workers` is below 1, or the time limit is not positive.
         OutputError: The result cannot be written, or the beginning of another one is in its place.
         RenderError: Nothing here can draw the images.
-        ServerError: The policy's server broke off.
+        ServerError: The policy's server is gone; what is already played is kept.
     """
     if episodes < 1:
         raise OptionError(f"episodes must be at least 1, not {episodes}")
@@ -171,6 +187,7 @@ def evaluate(
         "task_digest": lock.digest(task),
         "split": split,
         "policy": contender.name,
+        "policy_kind": contender.kind,
         "policy_hash": contender.hash,
         "decision_limit_s": decision_limit_s,
         "suite_version": provenance.suite_version(),

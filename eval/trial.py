@@ -5,12 +5,11 @@ held; the policy, which is not told, plays on to the time limit. Up to the goal 
 this replaces would be the same episode anyway, since a scenario fixes everything that is random.
 """
 
+import abc
 import contextlib
 import dataclasses
 import hashlib
-import random
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,13 +20,14 @@ import dm_env
 import numpy as np
 import numpy.typing as npt
 
-from hvs_suite.errors import ServerError
 from hvs_suite.eval.result_file import ERRORS, EpisodeRow
-from hvs_suite.rollout import Action, Observation, Policy
+from hvs_suite.rollout import Action, Observation, Policy, seed_libraries
 
 NOT_FINITE = "not finite"
 WRONG_SHAPE = "wrong shape"
 TOO_SLOW = "too slow"
+# A policy in another process keeps the time itself; this much later the alarm goes off anyway (s).
+_GRACE_S = 5.0
 NEAR_MM = 1e-3
 """Re-simulated errors may differ by this much (mm): another processor rounds differently."""
 NEAR_DEG = 1e-5
@@ -78,6 +78,22 @@ class EpisodeLostError(Exception):
         self.detail = detail
 
 
+class Connected(abc.ABC):
+    """A policy at the other end of a connection, which is made before the clock starts.
+
+    `Policy.select_action` and `Policy.reset` of such a policy keep the time limit of a decision by
+    themselves; they and nobody else's raise `EpisodeLostError`.
+    """
+
+    @abc.abstractmethod
+    def connect(self) -> None:
+        """Makes the connection if there is none.
+
+        Raises:
+            ServerError: There is nobody at the other end. The run stops, and resumes.
+        """
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Trial:
     """A played scenario.
@@ -112,6 +128,8 @@ class PlayTrial:
 
     def __call__(self, env: Stage, policy: Policy, scenario: int) -> Trial:
         """Plays one scenario; a policy that breaks down loses it, and nothing else."""
+        if isinstance(policy, Connected):
+            policy.connect()
         return _play_policy(env, policy, scenario, self.decision_limit_s)
 
 
@@ -183,6 +201,8 @@ def tolerances(variant: Any) -> dict[str, float]:
 def _play_policy(env: Stage, policy: Policy, scenario: int, limit_s: float) -> Trial:
     """A live policy's trial: times, checks and guards each of its decisions."""
     shape = env.action_spec().shape
+    is_connected = isinstance(policy, Connected)
+    alarm_s = limit_s + _GRACE_S if is_connected else limit_s
     times = [0.0]
     detail = ""
 
@@ -190,15 +210,15 @@ def _play_policy(env: Stage, policy: Policy, scenario: int, limit_s: float) -> T
         nonlocal detail
         started = time.perf_counter()
         try:
-            with _deadline(limit_s):
+            with _deadline(alarm_s):
                 answer = call()
-        except ServerError:
-            # The connection broke, not the policy: the run stops, and resumes.
-            raise
         except _DeadlineError:
             detail = f"no answer within {limit_s:g} s"
             raise EpisodeLostError(TOO_SLOW, detail) from None
         except Exception as error:
+            if is_connected and isinstance(error, EpisodeLostError):
+                detail = error.detail
+                raise
             detail = f"{type(error).__name__}: {error}"
             raise EpisodeLostError(f"raised {type(error).__name__}", detail) from error
         times.append(time.perf_counter() - started)
@@ -217,7 +237,7 @@ def _play_policy(env: Stage, policy: Policy, scenario: int, limit_s: float) -> T
             raise
 
     def start() -> None:
-        _seed_libraries(env, scenario)
+        seed_libraries(episode_seed(env.info["split"], scenario))
         guarded(policy.reset)
 
     row, actions, nearness = play_trial(env, start, decide, scenario)
@@ -246,19 +266,6 @@ def _checked(answer: Any, shape: Sequence[int]) -> Action:
     if not np.all(np.isfinite(action)):
         raise EpisodeLostError(NOT_FINITE, "NaN or infinity in the action")
     return action
-
-
-def _seed_libraries(env: Stage, scenario: int) -> None:
-    """Starts the global generators anew for each scenario.
-
-    The suite uses none of them. Policies written elsewhere do (diffusion policies draw their noise
-    from torch's), and would otherwise depend on which scenarios a worker played before.
-    """
-    seed = episode_seed(env.info["split"], scenario)
-    random.seed(seed)
-    np.random.seed(seed)  # noqa: NPY002 - this is the generator that others use
-    if (torch := sys.modules.get("torch")) is not None:
-        torch.manual_seed(seed)
 
 
 def episode_seed(split: str, scenario: int) -> int:

@@ -9,6 +9,7 @@ import contextlib
 import dataclasses
 import multiprocessing
 import os
+import random
 import signal
 import sys
 import threading
@@ -245,7 +246,7 @@ def play[T](
         with contextlib.closing(make_env()) as env:
             policy = make_policy(env)
             for scenario in indices:
-                with _one_torch_thread():
+                with one_torch_thread():
                     result = run(env, policy, scenario)
                 yield result
 
@@ -272,8 +273,23 @@ def _checked(action: Any, shape: Sequence[int], scenario: int, step: int) -> Act
     return checked
 
 
+def seed_libraries(seed: int) -> None:
+    """Starts the global generators of Python, NumPy and, if it is loaded, torch anew.
+
+    The suite uses none of them. Policies written elsewhere do (diffusion policies draw their noise
+    from torch's), and would otherwise depend on which scenarios a worker played before.
+
+    Args:
+        seed: In [0, 2^32).
+    """
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002 - this is the generator that others use
+    if (torch := sys.modules.get("torch")) is not None:
+        torch.manual_seed(seed)
+
+
 @contextlib.contextmanager
-def _one_torch_thread() -> Iterator[None]:
+def one_torch_thread() -> Iterator[None]:
     """Holds torch to one thread if it is loaded: sums come out the same in every process."""
     torch = sys.modules.get("torch")
     if torch is None:
@@ -403,7 +419,7 @@ def _work(connection: Connection, job: _Job) -> None:
         with contextlib.closing(make_env()) as env:
             policy = make_policy(env)
             while (scenario := connection.recv()) is not None:
-                with _one_torch_thread():
+                with one_torch_thread():
                     result = run(env, policy, scenario)
                 connection.send(("result", result))
     except Exception as error:

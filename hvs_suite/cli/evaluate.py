@@ -22,7 +22,7 @@ class Evaluate:
     """Score a policy on scenarios 0 to N-1 of a split and write every episode to a result file.
 
     Interrupted, the same command goes on. A policy that raises, answers nonsense or is too slow
-    loses that episode, and the reason is counted.
+    loses that episode, and the reason is counted; so does one whose server breaks off.
 
     Attributes:
         task: Named task, such as align-thesis; give it several times for several tasks.
@@ -35,6 +35,7 @@ class Evaluate:
         episodes: Number of scenarios.
         workers: Processes that share the work; the result is the same for any number.
         decision_limit: Time after which a decision loses its episode (s).
+        server: Address of a policy server, such as ws://127.0.0.1:8765; 'hvs serve' starts one.
     """
 
     task: tuple[str, ...]
@@ -44,6 +45,7 @@ class Evaluate:
     episodes: int = 100
     workers: int = 1
     decision_limit: float = 10.0
+    server: str | None = None
 
     def run(self) -> int:
         """Evaluate, write the results, print their summaries."""
@@ -69,7 +71,11 @@ class Evaluate:
     def _find(self, task: str) -> "Contender":
         from hvs_suite.eval import protocol
 
-        return protocol.find(self.policy, task)
+        if self.server is None:
+            return protocol.find(self.policy, task)
+        from hvs_suite.eval import remote_policy
+
+        return remote_policy.find(self.server, self.policy, task, self.decision_limit)
 
     def _evaluate(self, task: str, path: Path, contender: "Contender") -> "Result":
         from hvs_suite.eval import protocol
