@@ -26,6 +26,8 @@ COMMANDS = {
     "record": "hvs_suite.cli.record:Record",
     "check": "hvs_suite.cli.check:Check",
     "replay": "hvs_suite.cli.replay:Replay",
+    "share": "hvs_suite.cli.share:Share",
+    "fetch": "hvs_suite.cli.fetch:Fetch",
     "pretrain": "hvs_suite.cli.pretrain:Pretrain",
     "evaluate": "hvs_suite.cli.evaluate:Evaluate",
     "serve": "hvs_suite.cli.serve:Serve",

@@ -1,0 +1,265 @@
+"""The dataset card: what a dataset holds and how it was made, for whoever finds it.
+
+``README.md`` with the front matter that the Hub reads, and one picture, written into the dataset.
+"""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hvs_suite.cell.robot import JOINT_NAMES
+from hvs_suite.datasets import reader
+from hvs_suite.datasets.features import SCENARIO, image_key
+from hvs_suite.datasets.metadata import DatasetMetadata, read_metadata
+from hvs_suite.files import replacing
+from hvs_suite.registry import find
+from hvs_suite.tasks.lock import digest
+from hvs_suite.tasks.variants import AlignVariant, with_options
+
+CARD = "README.md"
+PICTURE = "pictures.png"
+LICENCE = "apache-2.0"
+TAGS = ("LeRobot", "robotics", "visual-servoing", "kuka-lbr-iiwa", "hvs-suite")
+
+_TILE_PX = 160
+_COLUMNS = 6
+_GAP_PX = 6
+_TITLE_PX = 20
+
+
+@dataclasses.dataclass(frozen=True)
+class Contents:
+    """What a card counts.
+
+    Attributes:
+        episodes: Episodes.
+        frames: Frames.
+        successes: Episodes that reached the goal.
+        mean_steps: Mean control steps of an episode.
+        scenarios: Least and greatest scenario index.
+        size_mb: Size of all files (MB).
+    """
+
+    episodes: int
+    frames: int
+    successes: int
+    mean_steps: float
+    scenarios: tuple[int, int]
+    size_mb: float
+
+
+def write_card(root: Path, licence: str = LICENCE) -> str:
+    """Writes card and picture into a dataset.
+
+    Args:
+        root: The dataset.
+        licence: Identifier of its licence.
+
+    Returns:
+        The card's text without its front matter.
+
+    Raises:
+        DatasetError: The dataset is damaged.
+        OutputError: The folder cannot be written.
+    """
+    metadata = read_metadata(root)
+    info = reader.read_info(root)
+    with replacing(root / PICTURE) as temporary:
+        draw_pictures(root, info).save(temporary, "PNG")
+    body = describe(metadata, info, count(root), licence)
+    with replacing(root / CARD) as temporary:
+        temporary.write_text(_front_matter(metadata, licence) + body, encoding="utf-8")
+    return body
+
+
+def count(root: Path) -> Contents:
+    """Counts what a dataset holds.
+
+    Raises:
+        DatasetError: It is damaged.
+    """
+    outcomes: dict[int, bool] = {}
+    scenarios: list[int] = []
+    frames = 0
+    for file in sorted({place.file for place in reader.read_places(root)}):
+        table = reader.read_table(root, file, ["episode_index", "next.success", SCENARIO])
+        frames += table.num_rows
+        scenarios += table.column(SCENARIO).to_pylist()
+        for episode, success in zip(
+            table["episode_index"].to_pylist(), table["next.success"].to_pylist(), strict=True
+        ):
+            outcomes[episode] = outcomes.get(episode, False) or bool(success)
+    own = (CARD, PICTURE)
+    size = sum(
+        path.stat().st_size
+        for path in root.rglob("*")
+        if path.is_file() and path.relative_to(root).as_posix() not in own
+    )
+    return Contents(
+        len(outcomes),
+        frames,
+        sum(outcomes.values()),
+        frames / max(1, len(outcomes)),
+        (min(scenarios, default=0), max(scenarios, default=0)),
+        size / 1e6,
+    )
+
+
+def describe(
+    metadata: DatasetMetadata, info: dict[str, Any], contents: Contents, licence: str
+) -> str:
+    """The card's text, Markdown.
+
+    Args:
+        metadata: Origin of the dataset.
+        info: LeRobot's ``info.json``.
+        contents: What it holds.
+        licence: Identifier of its licence.
+    """
+    variant = with_options(find(metadata.task), metadata.options)
+    share = 100.0 * contents.successes / max(1, contents.episodes)
+    options = ", ".join(f"`{k}={v!r}`" for k, v in sorted(metadata.options.items())) or "as named"
+    noise = (
+        f"temporally correlated, {metadata.noise:g} rad far from the goal, on what is executed "
+        f"(`privileged.action_executed`); `action` is the expert's own"
+        if metadata.noise
+        else "none: `action` is what was executed"
+    )
+    rows = {
+        "task": f"`{metadata.task}`, version {metadata.task_version}",
+        "task digest": f"`{metadata.task_digest or digest(metadata.task)}`",
+        "options": options,
+        "instruction": variant.instruction,
+        "robot": f"KUKA LBR iiwa 7 R800, {JOINT_NAMES[0]} to {JOINT_NAMES[-1]}, simulated (MuJoCo)",
+        "split and scenarios": f"`{metadata.split}`, {contents.scenarios[0]} to "
+        f"{contents.scenarios[1]}",
+        "episodes": f"{contents.episodes:,}",
+        "frames": f"{contents.frames:,} at {info['fps']} a second, "
+        f"{contents.mean_steps:.1f} an episode",
+        "success": f"{contents.successes:,} of {contents.episodes:,} ({share:.1f} %)",
+        "demonstrator": "the suite's scripted expert: time-optimal motion within the limits of "
+        "joint speed and acceleration, replanned every step from the true state",
+        "noise": noise,
+        "images": _images(info),
+        "size": f"{contents.size_mb:.1f} MB",
+        "licence": licence,
+    }
+    lines = [
+        f"# {metadata.task}: demonstrations for visual servoing",
+        "",
+        f"![Camera pictures of the first episode, from start to goal]({PICTURE})",
+        "",
+        f"{_tolerance(variant)} Recorded with hvs_suite in LeRobot's format "
+        f"{info.get('codebase_version', 'v3.0')}.",
+        "",
+        "| | |",
+        "|---|---|",
+        *(f"| {name} | {value} |" for name, value in rows.items()),
+        "",
+        "Made by:",
+        "",
+        "```sh",
+        metadata.command or "# the command was not kept",
+        "```",
+        "",
+        "`observation.*` is what a policy may see. `privileged.*` is the simulator's truth, for "
+        "training and checks only. `hvs.json` holds task, split, options and noise, from which "
+        "`hvs check` plays every episode again and compares.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def draw_pictures(root: Path, info: dict[str, Any]) -> Any:
+    """Camera pictures of the first episode, evenly spaced in time, one row a camera.
+
+    Args:
+        root: The dataset.
+        info: LeRobot's ``info.json``.
+
+    Returns:
+        A ``PIL.Image``.
+
+    Raises:
+        DatasetError: They cannot be read.
+    """
+    from PIL import Image, ImageDraw
+
+    from hvs_suite.pictures import FAINT, INK, PAPER, font, resize
+
+    place = min(reader.read_places(root), key=lambda each: each.episode)
+    table = reader.read_episode(root, place)
+    titles = {"eih": "eye in hand", "eth": "eye to hand"}
+    cameras = [camera for camera in titles if image_key(camera) in info["features"]]
+    steps = np.unique(np.linspace(0, place.length - 1, _COLUMNS).round().astype(int))
+    pitch = _TILE_PX + _GAP_PX
+    size = (_GAP_PX + len(steps) * pitch, _GAP_PX + len(cameras) * (pitch + _TITLE_PX))
+    sheet = Image.new("RGB", size, PAPER)
+    draw = ImageDraw.Draw(sheet)
+    for row, camera in enumerate(cameras):
+        pictures = reader.read_pictures(root, place, table, image_key(camera), int(info["fps"]))
+        y = _GAP_PX + row * (pitch + _TITLE_PX)
+        draw.text((_GAP_PX, y), titles[camera], INK, font(13, bold=True))
+        for column, step in enumerate(steps):
+            x = _GAP_PX + column * pitch
+            sheet.paste(Image.fromarray(resize(pictures[step], _TILE_PX)), (x, y + _TITLE_PX))
+            # The first column's title stands where its time would.
+            if column:
+                time = f"{step / float(info['fps']):.1f} s"
+                draw.text((x + _TILE_PX, y + 1), time, FAINT, font(12), anchor="ra")
+    return sheet
+
+
+def _front_matter(metadata: DatasetMetadata, licence: str) -> str:
+    """The YAML that the Hub reads."""
+    tags = [*TAGS, metadata.task]
+    return "\n".join(
+        [
+            "---",
+            f"license: {licence}",
+            "task_categories:",
+            "- robotics",
+            "tags:",
+            *(f"- {tag}" for tag in tags),
+            "configs:",
+            "- config_name: default",
+            "  data_files: data/*/*.parquet",
+            "---",
+            "",
+            "",
+        ]
+    )
+
+
+def _images(info: dict[str, Any]) -> str:
+    """Each camera's size and how its pictures are kept."""
+    kept = []
+    for key, feature in sorted(info["features"].items()):
+        if feature["dtype"] in ("image", "video"):
+            height, width = feature["shape"][:2]
+            how = "PNG, lossless"
+            if feature["dtype"] == "video":
+                video = feature.get("info") or {}
+                how = f"video, {video.get('video.codec', 'unknown')}, lossy"
+            kept.append(f"`{key}` {width} x {height} px ({how})")
+    return "; ".join(kept) or "none"
+
+
+def _tolerance(variant: AlignVariant) -> str:
+    """What counts as success, in a sentence."""
+    if variant.position_tolerance_mm is not None:
+        length = f"{variant.position_tolerance_mm:g} mm"
+    else:
+        length = (
+            f"{variant.lateral_tolerance_mm:g} mm sideways and "
+            f"{variant.height_tolerance_mm:g} mm in height"
+        )
+    held = f", held for {variant.hold_steps} steps" if variant.hold_steps > 1 else ""
+    return (
+        f"The arm brings its flange {variant.standoff_m * 1000:.0f} mm above a "
+        f"{variant.target_diameter_m * 1000:.0f} mm {variant.marker}, facing it: within {length} "
+        f"and {variant.tilt_tolerance_deg:g} deg{held}, in at most {variant.time_limit_steps} "
+        f"steps of {variant.control_period_s:g} s."
+    )
