@@ -35,6 +35,19 @@ HELD_OUT_STREAM = 1
 Column = npt.NDArray[Any]
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Recording:
+    """Frames and their labels.
+
+    Attributes:
+        columns: Key to (n, k) float32; ``episode_index`` to (n,) int64.
+        images: Key to (n, H, W, C) uint8, usually memory-mapped.
+    """
+
+    columns: Mapping[str, Column]
+    images: Mapping[str, Frames]
+
+
 @dataclasses.dataclass(frozen=True)
 class Manifest:
     """What a dataset says of itself.
@@ -66,6 +79,14 @@ class Manifest:
             if key.startswith(IMAGE_PREFIX)
             for shape in [tuple(feature["shape"])]
         }
+
+    @property
+    def trained_keys(self) -> list[str]:
+        """The features that training reads: images, state, action, targets, goal."""
+        wanted = {STATE, ACTION, GOAL_POSITION, GOAL_NORMAL}
+        wanted |= {TARGET_PREFIX + name for name in self.cameras}
+        wanted |= {IMAGE_PREFIX + name for name in self.cameras}
+        return [key for key in self.features if key in wanted]
 
 
 def read_manifest(root: Path) -> Manifest:
@@ -116,7 +137,7 @@ def refuse_test_split(manifest: Manifest) -> None:
 
 
 class Demonstrations:
-    """Frames and labels of one dataset.
+    """Frames and labels of one dataset, and of what was added to it.
 
     Args:
         manifest: Of the dataset.
@@ -137,24 +158,39 @@ class Demonstrations:
         self, manifest: Manifest, cache: Path, seed: int, on_frames: OnFrames | None = None
     ) -> None:
         self.manifest = manifest
-        self._columns = _read_columns(manifest)
-        self._frames: dict[str, Frames] = {}
+        columns = _read_columns(manifest)
+        images: dict[str, Frames] = {}
         for name, shape in manifest.cameras.items():
             key = IMAGE_PREFIX + name
             if manifest.features[key]["dtype"] != "image":
                 raise DatasetError(
                     f"{manifest.root}: {key} is video; train on the lossless recording instead"
                 )
-            self._frames[key] = cached_frames(
+            images[key] = cached_frames(
                 manifest.root, key, shape, manifest.n_frames, cache, on_frames
             )
-        episodes = self._columns[EPISODE]
+        self._recordings = [Recording(columns, images)]
+        self._starts = np.array([0])
+        episodes = columns[EPISODE]
         names = np.unique(episodes)
         stream = np.random.Generator(np.random.Philox(key=[seed, HELD_OUT_STREAM]))
         n_held_out = max(1, round(HELD_OUT_SHARE * len(names))) if len(names) > 1 else 0
         held_out = np.isin(episodes, stream.permutation(names)[:n_held_out])
         self.training = np.flatnonzero(~held_out)
         self.held_out = np.flatnonzero(held_out)
+
+    def add(self, recording: Recording) -> None:
+        """Learn from more frames, all of them.
+
+        Args:
+            recording: The frames, with the same keys.
+        """
+        last = self._recordings[-1]
+        start = self._starts[-1] + len(last.columns[EPISODE])
+        more = np.arange(start, start + len(recording.columns[EPISODE]))
+        self._recordings.append(recording)
+        self._starts = np.append(self._starts, start)
+        self.training = np.concatenate([self.training, more])
 
     def batch(self, indices: npt.NDArray[np.int64]) -> dict[str, Tensor]:
         """Frames as LeRobot's loader would give them.
@@ -167,13 +203,18 @@ class Demonstrations:
         """
         # Neighbours on disk together: the same rows, fewer page faults.
         indices = np.sort(indices)
+        owner = np.searchsorted(self._starts, indices, side="right") - 1
+        parts = [
+            (self._recordings[i], indices[owner == i] - self._starts[i]) for i in np.unique(owner)
+        ]
+        first = self._recordings[0]
         batch = {
-            key: torch.from_numpy(column[indices])
-            for key, column in self._columns.items()
+            key: torch.from_numpy(np.concatenate([r.columns[key][rows] for r, rows in parts]))
+            for key in first.columns
             if key != EPISODE
         }
-        for key, frames in self._frames.items():
-            images = torch.from_numpy(frames[indices])
+        for key in first.images:
+            images = torch.from_numpy(np.concatenate([r.images[key][rows] for r, rows in parts]))
             # (B, H, W, C) stays the layout in memory, which is what the convolutions want.
             batch[key] = images.to(torch.float32).div_(255.0).permute(0, 3, 1, 2)
         return batch
@@ -221,9 +262,7 @@ def _read_columns(manifest: Manifest) -> dict[str, Column]:
     Returns:
         Key to (n_frames, k) float32; ``episode_index`` to (n_frames,) int64.
     """
-    wanted = {STATE, ACTION, GOAL_POSITION, GOAL_NORMAL}
-    wanted |= {TARGET_PREFIX + name for name in manifest.cameras}
-    keys = [key for key in manifest.features if key in wanted]
+    keys = [key for key in manifest.trained_keys if not key.startswith(IMAGE_PREFIX)]
     if ACTION not in keys or not manifest.cameras:
         raise DatasetError(f"{manifest.root} needs an action and at least one camera to learn from")
     parts: dict[str, list[Column]] = {key: [] for key in [*keys, EPISODE]}

@@ -1,4 +1,4 @@
-"""Behaviour cloning: trains the `hvs` policy on a recorded dataset.
+"""Behaviour cloning, with rounds of DAgger: trains the `hvs` policy on a recorded dataset.
 
 The loss is that of `HvsPolicy.forward`: the expert's joint step on a logarithmic scale, and the
 projected target as seen by each camera. A run is a function of dataset, seed and number of steps;
@@ -20,6 +20,7 @@ import torch
 
 from hvs_suite.errors import OptionError, OutputError
 from hvs_suite.files import check_writable, replacing
+from hvs_suite.policies.dagger import RoundSummary, play_round, read_round, round_shares
 from hvs_suite.policies.demonstrations import (
     Demonstrations,
     Manifest,
@@ -48,10 +49,10 @@ class Progress:
     """How a run is doing.
 
     Attributes:
-        stage: ``decoding`` or ``training``.
+        stage: ``decoding``, ``training`` or ``playing``.
         share: Part of the stage that is done, 0 to 1.
         step: Optimiser steps done.
-        frames: Frames decoded or trained on in this sitting.
+        frames: Frames decoded, played or trained on in this sitting.
         frames_per_s: Rate of that.
         seconds_left: Of this stage, at this rate (s).
         loss: Mean training loss of the last steps; NaN while decoding.
@@ -77,6 +78,8 @@ class Outcome:
         train_s: Training time, over all sittings (s).
         decode_s: Time spent decoding frames in this sitting (s).
         data_s: Part of the training time of this sitting spent waiting for batches (s).
+        play_s: Time spent on DAgger rounds in this sitting (s).
+        rounds: What the DAgger rounds came to.
         frames_per_s: Frames trained on a second in this sitting.
         loss: Mean training loss of the last steps.
         held_out_loss: Loss on held-out episodes at the end; NaN if there are none.
@@ -87,6 +90,8 @@ class Outcome:
     train_s: float
     decode_s: float
     data_s: float
+    play_s: float
+    rounds: tuple[RoundSummary, ...]
     frames_per_s: float
     loss: float
     held_out_loss: float
@@ -102,6 +107,9 @@ def pretrain(
     seed: int = 0,
     batch_size: int = 64,
     learning_rate: float = 2e-3,
+    dagger_rounds: int = 0,
+    dagger_frames: int = 6000,
+    workers: int = 2,
     checkpoint_period_s: float = 60.0,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> Outcome:
@@ -116,6 +124,10 @@ def pretrain(
         seed: Of initial weights, held-out episodes and order.
         batch_size: Frames a step.
         learning_rate: Peak of the schedule (a short warm-up, then a cosine to zero).
+        dagger_rounds: How often to let the policy play, the expert labelling every step, and to add
+            those frames. The budget counts training only.
+        dagger_frames: Frames a round.
+        workers: Processes that play the rounds; any number gives the same.
         checkpoint_period_s: Time between checkpoints (s).
         on_progress: Called while decoding and after every step.
 
@@ -128,6 +140,7 @@ def pretrain(
         OutputError: ``out`` cannot be written, or holds something else than this run.
     """
     _check_options(minutes, steps, batch_size, learning_rate)
+    _check_rounds(dagger_rounds, dagger_frames, workers)
     manifest = read_manifest(data)
     refuse_test_split(manifest)
     torch.set_num_threads(min(2, os.cpu_count() or 1))
@@ -135,6 +148,8 @@ def pretrain(
         "seed": seed,
         "batch_size": batch_size,
         "learning_rate": learning_rate,
+        "dagger_rounds": dagger_rounds,
+        "dagger_frames": dagger_frames,
         "dataset": fingerprint(data),
         "task": manifest.task,
     }
@@ -151,6 +166,7 @@ def pretrain(
         batch_size=batch_size,
         learning_rate=learning_rate,
         budget=_Budget(steps, None if minutes is None else 60.0 * minutes),
+        rounds=_Rounds(training / "dagger", dagger_rounds, dagger_frames, workers),
         checkpoint_period_s=checkpoint_period_s,
     )
     outcome = run.outcome(policy)
@@ -176,6 +192,20 @@ class _Budget:
         return max(shares)
 
 
+@dataclasses.dataclass(frozen=True)
+class _Rounds:
+    """Which DAgger rounds to play, and where they live."""
+
+    folder: Path
+    count: int
+    frames: int
+    workers: int
+
+    def path(self, number: int) -> Path:
+        """Folder of a round."""
+        return self.folder / f"round-{number + 1}"
+
+
 class _Run:
     """One sitting of a training run: clocks, reports and checkpoints around the loop."""
 
@@ -184,6 +214,8 @@ class _Run:
         self._on_progress = on_progress
         self._decode_s = 0.0
         self._data_s = 0.0
+        self._play_s = 0.0
+        self._rounds: list[RoundSummary] = []
         self._frames = 0
         self._sitting_s = 0.0
         self._counters = Counters()
@@ -215,6 +247,7 @@ class _Run:
         batch_size: int,
         learning_rate: float,
         budget: _Budget,
+        rounds: _Rounds,
         checkpoint_period_s: float,
     ) -> None:
         """Train until the budget is used up; the last checkpoint is the final one."""
@@ -224,6 +257,9 @@ class _Run:
         decay = policy.config.optimizer_weight_decay
         optimizer = torch.optim.AdamW(policy.parameters(), lr=learning_rate, weight_decay=decay)
         self._counters = load_state(state, policy, optimizer)
+        due = round_shares(rounds.count)
+        while len(self._rounds) < rounds.count and self._reopen(demonstrations, rounds):
+            pass
         order = _Order(demonstrations.training, batch_size, seed)
         before_s = self._counters.elapsed_s
         begun = budget.share(self._counters)
@@ -235,6 +271,14 @@ class _Run:
         )
         try:
             while (share := budget.share(self._counters)) < 1.0:
+                if len(self._rounds) < len(due) and share >= due[len(self._rounds)]:
+                    paused = time.perf_counter()
+                    self._checkpoint(policy, optimizer, demonstrations, state, writer)
+                    self._play_round(demonstrations, rounds)
+                    order = _Order(demonstrations.training, batch_size, seed)
+                    pause = time.perf_counter() - paused
+                    started, last_checkpoint = started + pause, time.perf_counter()
+                    self._play_s += pause
                 step = self._counters.step
                 for group in optimizer.param_groups:
                     group["lr"] = learning_rate * _schedule(share)
@@ -271,11 +315,48 @@ class _Run:
             train_s=self._counters.elapsed_s,
             decode_s=self._decode_s,
             data_s=self._data_s,
+            play_s=self._play_s,
+            rounds=tuple(self._rounds),
             frames_per_s=self._frames / max(1e-9, self._sitting_s),
             loss=self._loss,
             held_out_loss=self._held_out_loss,
             n_parameters=sum(p.numel() for p in policy.parameters()),
         )
+
+    def _reopen(self, demonstrations: Demonstrations, rounds: _Rounds) -> bool:
+        """Learn from the next round if an earlier sitting played it."""
+        found = read_round(rounds.path(len(self._rounds)))
+        if found is None:
+            return False
+        summary, recording = found
+        self._rounds.append(summary)
+        demonstrations.add(recording)
+        return True
+
+    def _play_round(self, demonstrations: Demonstrations, rounds: _Rounds) -> None:
+        """Play the next round with the checkpoint just written, and learn from it."""
+        started = time.perf_counter()
+        done = 0
+
+        def note(count: int) -> None:
+            nonlocal done
+            done += count
+            rate = done / max(1e-9, time.perf_counter() - started)
+            left = (rounds.frames - done) / max(1e-9, rate)
+            self._report("playing", done / rounds.frames, done, rate, left)
+
+        manifest = demonstrations.manifest
+        first = self._rounds[-1].next_scenario if self._rounds else manifest.n_episodes
+        play_round(
+            manifest,
+            self._out,
+            rounds.path(len(self._rounds)),
+            frames=rounds.frames,
+            first_scenario=first,
+            workers=rounds.workers,
+            on_frames=note,
+        )
+        self._reopen(demonstrations, rounds)
 
     def _checkpoint(
         self,
@@ -418,6 +499,14 @@ def _check_options(
         raise OptionError(f"batch_size must be at least 1, not {batch_size}")
     if not 0.0 < learning_rate < 1.0:
         raise OptionError(f"learning_rate must be between 0 and 1, not {learning_rate}")
+
+
+def _check_rounds(rounds: int, frames: int, workers: int) -> None:
+    if rounds < 0:
+        raise OptionError(f"dagger_rounds must be 0 or more, not {rounds}")
+    for name, value in (("dagger_frames", frames), ("workers", workers)):
+        if value < 1:
+            raise OptionError(f"{name} must be at least 1, not {value}")
 
 
 def _claim(out: Path, settings: Mapping[str, Any]) -> None:

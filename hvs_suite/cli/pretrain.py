@@ -1,4 +1,4 @@
-"""``hvs pretrain``: the ``hvs`` policy, trained on a dataset by behaviour cloning."""
+"""``hvs pretrain``: the ``hvs`` policy, trained on a dataset by behaviour cloning and DAgger."""
 
 import dataclasses
 import math
@@ -27,12 +27,21 @@ class Pretrain:
         out: Folder for the checkpoint; loads with from_pretrained.
         minutes: Stop after this much training, decoding not counted (min).
         steps: Stop after this many optimiser steps.
+        dagger_rounds: DAgger rounds, spread over the training: the policy plays, the expert labels
+            every step, and the frames are added. Their time comes on top of --minutes.
+        dagger_frames: Frames a round.
+        workers: Processes that play the rounds.
+        seed: Of initial weights, held-out episodes and order.
     """
 
     data: Path
     out: Path
     minutes: float | None = None
     steps: int | None = None
+    dagger_rounds: int = 0
+    dagger_frames: int = 6000
+    workers: int = 2
+    seed: int = 0
 
     def run(self) -> None:
         """Train, showing how it goes, and say where the checkpoint is."""
@@ -47,11 +56,20 @@ class Pretrain:
                 self.out,
                 minutes=minutes,
                 steps=self.steps,
+                dagger_rounds=self.dagger_rounds,
+                dagger_frames=self.dagger_frames,
+                workers=self.workers,
+                seed=self.seed,
                 on_progress=lambda state: update(state.stage, state.share, _words(state)),
             )
         held_out = (
             "" if math.isnan(outcome.held_out_loss) else f", held out {outcome.held_out_loss:.4f}"
         )
+        for number, played in enumerate(outcome.rounds, 1):
+            print(
+                f"DAgger round {number}: {played.frames} frames, {played.successes} of "
+                f"{played.episodes} episodes solved, {played.collisions} collisions"
+            )
         print(
             f"{outcome.step} steps in {outcome.train_s:.0f} s, "
             f"{outcome.frames_per_s:.0f} frames/s, {outcome.n_parameters:,} parameters"

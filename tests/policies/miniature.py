@@ -27,6 +27,7 @@ def write_dataset(
     task: str = "align-easy",
     split: str = "train",
     n_files: int = 1,
+    options: Mapping[str, Any] | None = None,
 ) -> None:
     """Write frames as a LeRobot v3 dataset with images in parquet.
 
@@ -37,6 +38,7 @@ def write_dataset(
         task: For ``hvs.json``.
         split: For ``hvs.json``.
         n_files: Data files to spread the frames over.
+        options: Task options, for ``hvs.json``.
     """
     (root / "meta").mkdir(parents=True)
     (root / "data" / "chunk-000").mkdir(parents=True)
@@ -53,7 +55,9 @@ def write_dataset(
         "features": features,
     }
     (root / "meta" / "info.json").write_text(json.dumps(info))
-    write_metadata(root, DatasetMetadata(task=task, task_version=1, split=split))
+    write_metadata(
+        root, DatasetMetadata(task=task, task_version=1, split=split, options=dict(options or {}))
+    )
     for number, rows in enumerate(np.array_split(np.arange(len(episode_index)), n_files)):
         arrays: dict[str, Any] = {"episode_index": pa.array(episode_index[rows])}
         for key, values in columns.items():
