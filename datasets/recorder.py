@@ -129,7 +129,7 @@ def record(
     )
     try:
         with contextlib.closing(played):
-            for demonstration in _in_order(played, len(outcomes)):
+            for demonstration in in_order(played, len(outcomes)):
                 writer.save(demonstration)
                 tracker.saved(len(demonstration.frames), demonstration.success)
         writer.publish()
@@ -149,7 +149,7 @@ def record(
     return tracker.state()
 
 
-def _in_order[T: Any](demonstrations: Iterable[T], first: int) -> Iterator[T]:
+def in_order[T: Any](demonstrations: Iterable[T], first: int) -> Iterator[T]:
     """Demonstrations by scenario, holding back those that ended before their turn."""
     waiting: dict[int, T] = {}
     turn = first
