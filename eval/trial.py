@@ -8,6 +8,7 @@ this replaces would be the same episode anyway, since a scenario fixes everythin
 import abc
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import signal
 import threading
@@ -150,6 +151,7 @@ def play_trial(
     """
     env.goal_ends_episode = False
     spec = env.action_spec()
+    low, high = np.float32(spec.minimum), np.float32(spec.maximum)
     bounds = _near_bounds(env.variant)
     time_step = env.reset(scenario=scenario)
     actions: list[Action] = []
@@ -163,8 +165,9 @@ def play_trial(
         start()
         while not time_step.last():
             action = decide(time_step.observation)
-            executed = np.clip(action, spec.minimum, spec.maximum).astype(np.float32)
-            n_clipped += bool(np.any(executed != action))
+            # Both are float32, and np.clip takes three times as long.
+            executed = np.minimum(np.maximum(action, low), high)
+            n_clipped += bool((executed != action).any())
             time_step = env.step(executed)
             actions.append(action)
             info = env.info
@@ -210,8 +213,11 @@ def _play_policy(env: Stage, policy: Policy, scenario: int, limit_s: float) -> T
         nonlocal detail
         started = time.perf_counter()
         try:
-            with _deadline(alarm_s):
+            set_alarm(alarm_s)
+            try:
                 answer = call()
+            finally:
+                set_alarm(0.0)
         except _DeadlineError:
             detail = f"no answer within {limit_s:g} s"
             raise EpisodeLostError(TOO_SLOW, detail) from None
@@ -240,7 +246,8 @@ def _play_policy(env: Stage, policy: Policy, scenario: int, limit_s: float) -> T
         seed_libraries(episode_seed(env.info["split"], scenario))
         guarded(policy.reset)
 
-    row, actions, nearness = play_trial(env, start, decide, scenario)
+    with _alarm_clock() as set_alarm:
+        row, actions, nearness = play_trial(env, start, decide, scenario)
     return Trial(
         row=row,
         actions=actions,
@@ -263,7 +270,7 @@ def _checked(answer: Any, shape: Sequence[int]) -> Action:
         raise EpisodeLostError(WRONG_SHAPE, f"{type(answer).__name__} is no array") from error
     if action.shape != tuple(shape):
         raise EpisodeLostError(WRONG_SHAPE, f"shape {action.shape} instead of {tuple(shape)}")
-    if not np.all(np.isfinite(action)):
+    if not np.isfinite(action).all():
         raise EpisodeLostError(NOT_FINITE, "NaN or infinity in the action")
     return action
 
@@ -279,20 +286,23 @@ class _DeadlineError(BaseException):
 
 
 @contextlib.contextmanager
-def _deadline(seconds: float) -> Iterator[None]:
-    """Raises `_DeadlineError` in the block after a time; in other threads than the main, never."""
+def _alarm_clock() -> Iterator[Callable[[float], object]]:
+    """Yields a function that sets an alarm after some seconds, 0 for none, in the block.
+
+    It raises `_DeadlineError`; in other threads than the main, never.
+    """
     if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "SIGALRM"):
-        yield
+        yield lambda seconds: None
         return
 
     def strike(signal_number: int, frame: FrameType | None) -> None:
         raise _DeadlineError
 
+    before, _ = signal.setitimer(signal.ITIMER_REAL, 0.0)
     handler = signal.signal(signal.SIGALRM, strike)
-    before, _ = signal.setitimer(signal.ITIMER_REAL, seconds)
     started = time.monotonic()
     try:
-        yield
+        yield functools.partial(signal.setitimer, signal.ITIMER_REAL)
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, handler)
