@@ -1,211 +1,261 @@
-"""Draws the board as one web page: no network, sortable, readable on a phone and in the dark."""
+"""Draws the board as one web page: no network, sortable, readable on a phone and in the dark.
+
+Everything is in the file: style, script, plots and clips. The style and the script lie beside this
+module as ``board.css`` and ``board.js``.
+"""
 
 import html
-from collections.abc import Sequence
+import importlib.resources
+from collections.abc import Mapping, Sequence
 
+from markdown_it import MarkdownIt
+
+from hvs_suite.eval import board_entry, board_matrix, board_plots
+from hvs_suite.eval.board_clips import Clip
 from hvs_suite.eval.board_tables import (
     COLUMNS,
+    DASH,
     NOTE,
+    SUCCESS,
+    VERIFIED,
     Column,
     Entry,
+    Overall,
     by_task,
+    describe,
     interval,
     overall,
     percent,
 )
-from hvs_suite.eval.result_file import Result
-
-STYLE = """
-:root { color-scheme: light dark; --paper: #faf9f7; --card: #fff; --ink: #1c1e21; --soft: #63676d;
-  --line: #e3e0db; --track: #ece9e4; --mark: #d9560b; --band: #f4b48a; }
-@media (prefers-color-scheme: dark) { :root { --paper: #14161a; --card: #1c1f24; --ink: #eceae6;
-  --soft: #9ba0a8; --line: #2d3138; --track: #2a2e35; --mark: #ff8a3d; --band: #7a4420; } }
-* { box-sizing: border-box; }
-body { margin: 0; background: var(--paper); color: var(--ink);
-  font: 16px/1.5 system-ui, -apple-system, "Segoe UI", sans-serif; }
-main { max-width: 78rem; margin: 0 auto; padding: 2.5rem 1.25rem 4rem; }
-h1 { margin: 0; font-size: 1.9rem; letter-spacing: -.02em; }
-h2 { margin: 2.75rem 0 .25rem; font-size: 1.25rem; }
-p { margin: .4rem 0 1rem; max-width: 46rem; color: var(--soft); }
-.sheet { overflow-x: auto; background: var(--card); border: 1px solid var(--line);
-  border-radius: 10px; }
-table { width: 100%; border-collapse: separate; border-spacing: 0;
-  font-variant-numeric: tabular-nums; }
-th, td { padding: .6rem .8rem; text-align: right; border-bottom: 1px solid var(--line);
-  white-space: nowrap; }
-tbody tr:last-child > * { border-bottom: 0; }
-thead th { font-size: .8rem; font-weight: 500; color: var(--soft); vertical-align: bottom;
-  white-space: normal; line-height: 1.25; }
-th:first-child { text-align: left; }
-tbody th { font-weight: 600; min-width: 6rem; }
-thead button { all: unset; cursor: pointer; }
-thead button:hover, thead [aria-sort] button { color: var(--ink); }
-thead button:focus-visible { outline: 2px solid var(--mark); outline-offset: 3px; }
-thead [aria-sort=ascending] button::after { content: " \\2191"; }
-thead [aria-sort=descending] button::after { content: " \\2193"; }
-svg { display: block; width: 100%; min-width: 7rem; height: 12px; }
-.track { fill: var(--track); } .band { fill: var(--band); } .mark { fill: var(--mark); }
-td.success { min-width: 9rem; } td.success b { font-weight: 600; }
-.matrix small { display: block; color: var(--soft); font-size: .78rem; }
-.matrix th:first-child { position: sticky; left: 0; background: var(--card); }
-footer { margin-top: 3rem; color: var(--soft); font-size: .85rem; }
-label { display: none; }
-@media (max-width: 44rem) {
-  main { padding-top: 1.5rem; }
-  label { display: block; margin-bottom: .5rem; color: var(--soft); font-size: .9rem; }
-  .task { border: 0; background: none; overflow: visible; }
-  .task table, .task tbody, .task tr, .task th, .task td { display: block; }
-  .task thead { display: none; }
-  .task tr { display: grid; grid-template-columns: 1fr 1fr; gap: .6rem 1rem; padding: 1rem;
-    margin-bottom: .75rem; background: var(--card); border: 1px solid var(--line);
-    border-radius: 10px; }
-  .task th, .task td { padding: 0; border: 0; text-align: left; white-space: normal;
-    overflow-wrap: anywhere; }
-  .task th, .task td.success { grid-column: 1 / -1; }
-  .task td::before { content: attr(data-title); display: block; color: var(--soft);
-    font-size: .75rem; line-height: 1.2; }
-}
-"""
-
-SCRIPT = """
-for (const sheet of document.querySelectorAll(".task")) {
-  const body = sheet.querySelector("tbody");
-  const heads = [...sheet.querySelectorAll("thead th")];
-  const choice = sheet.parentElement.querySelector("select");
-  const sort = (column, down) => {
-    const sign = down ? -1 : 1;
-    const key = row => row.children[column].dataset.value;
-    const compare = (a, b) => {
-      const x = key(a), y = key(b);
-      if (x === "" || y === "") return (x === "") - (y === "");
-      return sign * (column ? x - y : x.localeCompare(y));
-    };
-    body.append(...[...body.rows].sort(compare));
-    heads.forEach(head => head.removeAttribute("aria-sort"));
-    heads[column].setAttribute("aria-sort", down ? "descending" : "ascending");
-    choice.value = column;
-  };
-  heads.forEach((head, column) => head.querySelector("button").addEventListener("click", () => {
-    const now = head.getAttribute("aria-sort");
-    sort(column, now ? now === "ascending" : "down" in head.dataset);
-  }));
-  choice.addEventListener("change", () => {
-    const column = Number(choice.value);
-    sort(column, "down" in heads[column].dataset);
-  });
-}
-"""
 
 
-def page(entries: Sequence[Entry]) -> str:
-    """Returns the whole page; the same entries give the same text."""
+def page(
+    entries: Sequence[Entry], clips: Mapping[tuple[str, str], Sequence[Clip]] | None = None
+) -> str:
+    """Returns the whole page; the same entries and clips give the same text.
+
+    Args:
+        entries: One or more.
+        clips: By (policy, task without version); none by default.
+    """
     tables = by_task(entries)
-    sections = "\n".join(_section(task, table) for task, table in tables.items())
+    # By name, not by rank: a policy keeps its colour when others come.
+    colours = {policy: k for k, policy in enumerate(sorted({e.policy for e in entries}))}
+    sections = "\n".join(_section(task, table, colours) for task, table in tables.items())
+    sheets = "\n".join(
+        board_entry.sheet(entry, (clips or {}).get((entry.policy, entry.result.summary.task), ()))
+        for table in tables.values()
+        for entry in table
+    )
+    links = "".join(
+        f'<a href="#{html.escape(task)}">{html.escape(table[0].result.summary.task)}</a>'
+        for task, table in tables.items()
+    )
     return f"""<!doctype html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy"
-  content="default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; \
+style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:">
 <title>hvs_suite leaderboard</title>
-<style>{STYLE}</style>
+<style>
+{_resource("board.css")}</style>
 </head>
 <body>
 <main>
 <h1>hvs_suite leaderboard</h1>
-<p>A KUKA LBR iiwa 7 places its tool over a target it sees with one camera in the hand and one
-beside the cell. {html.escape(NOTE)}</p>
-<section>
-<h2>Success on all tasks</h2>
-<p>Ordered by mean success; a task without a result counts as 0 %.</p>
-{_matrix(entries, list(tables))}
+<p>A KUKA LBR iiwa 7 places its tool over a target that it sees with one camera in its hand and one
+looking on from above. Open a policy to see it succeed and fail, and where it lands.</p>
+<div class="bar-top"><input type="search" id="search" placeholder="Search policies"
+aria-label="Search policies" autocomplete="off"><nav aria-label="Tasks">{links}
+<a href="#submit">submit</a></nav></div>
+<p id="found" role="status"></p>
+<section id="all-tasks">
+<h2>All tasks</h2>
+<p>Mean success over all tasks; a task without a result counts as 0 %.</p>
+{_overall(overall(entries), list(tables), colours)}
+<details class="note"><summary>What the figures mean</summary><p>{html.escape(NOTE)}</p></details>
 </section>
 {sections}
+<section id="submit" class="prose">
+{_submitting()}
+</section>
 <footer>Written by <code>hvs leaderboard</code> from the result files.</footer>
 </main>
-<script>{SCRIPT}</script>
+{sheets}
+<script>
+{_resource("board.js")}</script>
 </body>
 </html>
 """
 
 
-def _matrix(entries: Sequence[Entry], tasks: Sequence[str]) -> str:
+def _overall(rows: Sequence[Overall], tasks: Sequence[str], colours: Mapping[str, int]) -> str:
     """Returns the table of policies against tasks."""
-    head = "".join(f'<th scope="col">{html.escape(task)}</th>' for task in tasks)
-    rows = []
-    for policy, row in overall(entries).items():
-        cells = "".join(_matrix_cell(row.get(task)) for task in tasks)
-        rows.append(f'<tr><th scope="row">{html.escape(policy)}</th>{cells}</tr>')
+    head = _head(
+        [("policy", False), ("mean", True), *((task, True) for task in tasks)], sorted_by=1
+    )
+    body = []
+    for row in rows:
+        name = html.escape(row.policy)
+        cells = [
+            f'<td data-value="{row.mean!r}"><b>{percent(row.mean)}</b>'
+            f"<small>{interval(row.low, row.high)}</small>"
+            f"{board_plots.bar(row.low, row.mean, row.high)}</td>"
+        ]
+        cells += [_overall_cell(row.entries.get(task)) for task in tasks]
+        body.append(
+            f'<tr data-policy="{name}"><th scope="row" data-value="{name}">'
+            f"{_swatch(colours[row.policy])}{name}</th>{''.join(cells)}</tr>"
+        )
     return (
-        f'<div class="sheet"><table class="matrix"><thead><tr><th scope="col">policy</th>{head}'
-        f"</tr></thead>\n<tbody>\n{chr(10).join(rows)}\n</tbody></table></div>"
+        f'<div class="sheet sortable"><table class="matrix"><thead><tr>{head}</tr></thead>\n'
+        f"<tbody>\n{chr(10).join(body)}\n</tbody></table></div>"
     )
 
 
-def _matrix_cell(entry: Entry | None) -> str:
+def _overall_cell(entry: Entry | None) -> str:
     if entry is None:
-        return "<td>\N{EN DASH}</td>"
-    rate = percent(entry.result.summary.pc_success)
-    return f"<td>{rate}<small>{interval(entry.result)}</small>{_bar(entry.result)}</td>"
-
-
-def _section(task: str, table: Sequence[Entry]) -> str:
-    """Returns one task's heading and sortable table."""
-    columns = (
-        Column("policy", lambda r: None, lambda r: ""),
-        *COLUMNS,
+        return f'<td data-value="">{DASH}</td>'
+    return (
+        f'<td data-value="{SUCCESS.value(entry)!r}"><a href="{board_entry.link(entry)}">'
+        f"{SUCCESS.text(entry)}</a><small>{SUCCESS.interval(entry)}</small>{_bar(entry)}</td>"
     )
-    head = "".join(
-        f'<th scope="col"{" data-down" if column.larger_first else ""}'
-        # The rows arrive in this order.
-        f"{' aria-sort=descending' if column.title == 'success' else ''}>"
-        f'<button type="button">{html.escape(column.title)}</button></th>'
-        for column in columns
+
+
+def _section(task: str, table: Sequence[Entry], colours: dict[str, int]) -> str:
+    """Returns one task: table, curves, landings, comparison."""
+    head = _head(
+        [("policy", False), *((column.title, column.larger_first) for column in COLUMNS)],
+        sorted_by=1,
     )
     options = "".join(
-        f'<option value="{index}"{" selected" if column.title == "success" else ""}>'
-        f"{html.escape(column.title)}</option>"
-        for index, column in enumerate(columns)
+        f'<option value="{index}"{" selected" if index == 1 else ""}>{html.escape(title)}</option>'
+        for index, title in enumerate(("policy", *(column.title for column in COLUMNS)))
     )
-    rows = "\n".join(_row(entry) for entry in table)
-    split = html.escape(table[0].result.summary.split)
-    return f"""<section>
-<h2>{html.escape(task)}</h2>
-<p>First scenarios of the split <code>{split}</code>.</p>
+    rows = "\n".join(_row(entry, colours[entry.policy]) for entry in table)
+    summary = table[0].result.summary
+    name = html.escape(task)
+    return f"""<section id="{name}">
+<h2>{name}</h2>
+<p>{html.escape(describe(summary.task))} Split <code>{html.escape(summary.split)}</code>.</p>
 <label>Sort by <select>{options}</select></label>
-<div class="sheet task"><table><thead><tr>{head}</tr></thead>
+<div class="sheet task sortable"><table><thead><tr>{head}</tr></thead>
 <tbody>
 {rows}
 </tbody></table></div>
+<div class="plots">
+<figure>{board_plots.tolerance_plot(table, colours)}
+<figcaption>Success against tolerance, where the policy settles. 1 is the task's own tolerance;
+shaded, the pointwise 95 % intervals.</figcaption></figure>
+<figure>{board_plots.steps_plot(table, colours)}
+<figcaption>Success against time: solved within so many control steps.</figcaption></figure>
+</div>
+{_legend(table, colours)}
+<h3>Where they land</h3>
+<p>Around the target at the time limit, in a picture of {2 * board_entry.sideways(table[0]):g} mm to
+each side; the circle is the tolerance.</p>
+<div class="landings">{"".join(_landing(entry) for entry in table)}</div>
+{_pairs(table)}
 </section>"""
 
 
-def _row(entry: Entry) -> str:
-    name = html.escape(entry.policy)
-    cells = "".join(_figure(column, entry.result) for column in COLUMNS)
-    return f'<tr><th scope="row" data-value="{name}">{name}</th>{cells}</tr>'
-
-
-def _figure(column: Column, result: Result) -> str:
-    value = column.value(result)
-    key = "" if value is None else repr(float(value))
-    text = html.escape(column.text(result))
-    title = html.escape(column.title)
-    if column.title == "success":
-        text = f"<b>{text}</b>{_bar(result)}"
-        return f'<td class="success" data-title="{title}" data-value="{key}">{text}</td>'
-    return f'<td data-title="{title}" data-value="{key}">{text}</td>'
-
-
-def _bar(result: Result) -> str:
-    """Returns the success rate and its interval, drawn to scale from 0 to 100 %."""
-    rate = result.summary.pc_success
-    low, high = result.summary.pc_success_ci95
+def _pairs(table: Sequence[Entry]) -> str:
+    if len(table) < 2:
+        return ""
     return (
-        f'<svg viewBox="0 0 100 12" preserveAspectRatio="none" role="img" '
-        f'aria-label="{percent(rate)}, between {interval(result)}">'
-        '<rect class="track" y="5" width="100" height="2"/>'
-        f'<rect class="band" x="{low:.2f}" y="3" width="{high - low:.2f}" height="6"/>'
-        f'<rect class="mark" x="{min(rate, 98.5):.2f}" y="1" width="1.5" height="10"/></svg>'
+        f"<h3>Each with each</h3><p>{html.escape(board_matrix.CAPTION)}</p>"
+        f"{board_matrix.matrix(table)}"
     )
+
+
+def _head(columns: Sequence[tuple[str, bool]], sorted_by: int) -> str:
+    """Returns sortable headings from (title, larger first); the rows arrive sorted by one."""
+    return "".join(
+        f'<th scope="col"{" data-down" if down else ""}'
+        f"{' aria-sort=descending' if index == sorted_by else ''}>"
+        f'<button type="button">{html.escape(title)}</button></th>'
+        for index, (title, down) in enumerate(columns)
+    )
+
+
+def _row(entry: Entry, colour: int) -> str:
+    name = html.escape(entry.policy)
+    cells = "".join(_figure(column, entry) for column in COLUMNS)
+    return (
+        f'<tr data-policy="{name}"><th scope="row" data-value="{name}">{_swatch(colour)}'
+        f'<a href="{board_entry.link(entry)}">{name}</a></th>{cells}</tr>'
+    )
+
+
+def _figure(column: Column, entry: Entry) -> str:
+    value = column.value(entry)
+    text = html.escape(column.text(entry))
+    below = html.escape(column.interval(entry))
+    kind = ""
+    if column is SUCCESS:
+        text = f"<b>{text}</b> <small>{below}</small>{_bar(entry)}"
+        kind = ' class="success"'
+    elif column is VERIFIED:
+        whole = " whole" if entry.n_played == entry.result.summary.n_episodes else ""
+        text = (
+            f'<span class="badge{whole}" title="Scenarios whose logged actions were played again '
+            f'and gave the same numbers">\N{CHECK MARK} {text}</span>'
+        )
+    elif below:
+        text += f" <small>{below}</small>"
+    return (
+        f'<td{kind} data-title="{html.escape(column.title)}" '
+        f'data-value="{"" if value is None else repr(float(value))}">{text}</td>'
+    )
+
+
+def _landing(entry: Entry) -> str:
+    rows = entry.result.episodes
+    tolerance = board_entry.sideways(entry)
+    inside = sum(board_plots.is_inside(row, 2 * tolerance) for row in rows)
+    plot = board_plots.landing_plot(
+        rows, 2 * tolerance, tolerance, f"Landings of {entry.policy} around the target"
+    )
+    name = html.escape(entry.policy)
+    return (
+        f'<figure data-policy="{name}">{plot}<figcaption><b>{name}</b> {inside} of {len(rows)} in '
+        "the picture</figcaption></figure>"
+    )
+
+
+def _legend(table: Sequence[Entry], colours: Mapping[str, int]) -> str:
+    buttons = "".join(
+        f'<button type="button" data-policy="{html.escape(entry.policy)}">'
+        f"{_swatch(colours[entry.policy])}{html.escape(entry.policy)}</button>"
+        for entry in table
+    )
+    return (
+        f'<div class="legend" aria-label="Point at a policy to pick out its curves">{buttons}</div>'
+    )
+
+
+def _swatch(colour: int) -> str:
+    broken = " broken" if colour >= board_plots.COLOURS else ""
+    return f'<i class="swatch c{colour % board_plots.COLOURS}{broken}"></i>'
+
+
+def _bar(entry: Entry) -> str:
+    low, high = entry.result.summary.pc_success_ci95
+    return board_plots.bar(low, entry.result.summary.pc_success, high)
+
+
+def _submitting() -> str:
+    """Returns ``SUBMITTING.md`` as HTML, its headings one level lower."""
+    parser = MarkdownIt("commonmark", {"html": False})
+    tokens = parser.parse(_resource("SUBMITTING.md"))
+    for token in tokens:
+        if token.type in ("heading_open", "heading_close"):
+            token.tag = f"h{int(token.tag[1]) + 1}"
+    rendered: str = parser.renderer.render(tokens, parser.options, {})
+    return rendered
+
+
+def _resource(name: str) -> str:
+    return (importlib.resources.files("hvs_suite.eval") / name).read_text(encoding="utf-8")

@@ -1,16 +1,24 @@
 """What the board shows, whatever draws it: entries, their order, columns, and Markdown."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
-from hvs_suite.eval.result_file import Result
+from hvs_suite import registry, statistics
+from hvs_suite.eval.board_replays import Replay
+from hvs_suite.eval.result_file import Result, SettledErrorSummary
+from hvs_suite.eval.submission import Submission
 from hvs_suite.tasks.variants import TASKS
 
 NOTE = (
-    "Success is the share of scenarios solved, with its Wilson 95 % interval. Errors are taken at "
-    "the end of each episode's last control step, over all episodes, failures included. Steps to "
-    "goal are the mean over successes."
+    "Success is the share of scenarios solved, with its Wilson 95 % interval. Steps to goal are "
+    "the mean over successes, beside it as a multiple of the expert's on the scenarios that both "
+    "solve. Settled errors are taken at the time limit, the goal not ending the episode, over all "
+    "episodes, failures included: interquartile mean with its bootstrap interval, and 95th "
+    "percentile. The sharpest tolerance is the multiple of the task's own that 95 % of the "
+    "scenarios settle within. Every result was verified: the logged actions of some or all of its "
+    "scenarios were played again and gave the same numbers."
 )
+DASH = "\N{EN DASH}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,15 +28,26 @@ class Entry:
     Attributes:
         policy: Name on the board: the folder that holds the result.
         result: The checked result.
+        n_played: Scenarios whose actions were played again, and gave the same numbers.
+        steps_over_expert: Steps to goal over the expert's, on the scenarios that both solved; None
+            where there are none, or no expert on the board.
     """
 
     policy: str
     result: Result
+    n_played: int
+    steps_over_expert: float | None = None
 
     @property
     def task(self) -> str:
         """Named task with its version, such as ``align-easy-v1``."""
         return f"{self.result.summary.task}-v{self.result.metadata.task_version}"
+
+    @property
+    def played(self) -> str:
+        """How much of it was played again, such as ``20 of 1000``."""
+        n = self.result.summary.n_episodes
+        return f"all {n}" if self.n_played == n else f"{self.n_played} of {n}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,75 +59,111 @@ class Column:
         value: Number to sort by; None where an entry has no such figure.
         text: The figure as people read it.
         larger_first: Sorting by it starts with the largest.
+        interval: Its 95 % interval as people read it; empty where it has none.
     """
 
     title: str
-    value: Callable[[Result], float | None]
-    text: Callable[[Result], str]
+    value: Callable[[Entry], float | None]
+    text: Callable[[Entry], str]
     larger_first: bool = False
+    interval: Callable[[Entry], str] = lambda entry: ""
 
 
+SUCCESS = Column(
+    "success",
+    lambda e: e.result.summary.pc_success,
+    lambda e: percent(e.result.summary.pc_success),
+    larger_first=True,
+    interval=lambda e: interval(*e.result.summary.pc_success_ci95),
+)
+VERIFIED = Column("verified", lambda e: e.n_played, lambda e: e.played, larger_first=True)
 COLUMNS = (
-    Column(
-        "success",
-        lambda r: r.summary.pc_success,
-        lambda r: percent(r.summary.pc_success),
-        larger_first=True,
-    ),
-    Column(
-        "95 % interval",
-        lambda r: r.summary.pc_success_ci95[0],
-        lambda r: interval(r),
-        larger_first=True,
-    ),
+    SUCCESS,
     Column(
         "collisions",
-        lambda r: 100 * r.summary.n_collision / r.summary.n_episodes,
-        lambda r: percent(100 * r.summary.n_collision / r.summary.n_episodes),
+        lambda e: share(e, e.result.summary.n_collision),
+        lambda e: percent(share(e, e.result.summary.n_collision)),
     ),
     Column(
         "steps to goal",
-        lambda r: r.summary.steps_to_goal_mean,
-        lambda r: figure(r.summary.steps_to_goal_mean),
+        lambda e: e.result.summary.steps_to_goal_mean,
+        lambda e: figure(e.result.summary.steps_to_goal_mean),
     ),
     Column(
-        "position error, median (mm)",
-        lambda r: r.summary.position_error_mm.p50,
-        lambda r: figure(r.summary.position_error_mm.p50),
+        "× expert's steps",
+        lambda e: e.steps_over_expert,
+        lambda e: figure(e.steps_over_expert),
     ),
     Column(
-        "position error, p95 (mm)",
-        lambda r: r.summary.position_error_mm.p95,
-        lambda r: figure(r.summary.position_error_mm.p95),
+        "settled position error (mm)",
+        lambda e: e.result.summary.settled_position_error_mm.iqm,
+        lambda e: figure(e.result.summary.settled_position_error_mm.iqm),
+        interval=lambda e: iqm_interval(e.result.summary.settled_position_error_mm),
     ),
     Column(
-        "tilt error, median (deg)",
-        lambda r: r.summary.tilt_error_deg.p50,
-        lambda r: figure(r.summary.tilt_error_deg.p50),
+        "p95 (mm)",
+        lambda e: e.result.summary.settled_position_error_mm.p95,
+        lambda e: figure(e.result.summary.settled_position_error_mm.p95),
     ),
     Column(
-        "tilt error, p95 (deg)",
-        lambda r: r.summary.tilt_error_deg.p95,
-        lambda r: figure(r.summary.tilt_error_deg.p95),
+        "settled tilt error (deg)",
+        lambda e: e.result.summary.settled_tilt_error_deg.iqm,
+        lambda e: figure(e.result.summary.settled_tilt_error_deg.iqm),
+        interval=lambda e: iqm_interval(e.result.summary.settled_tilt_error_deg),
+    ),
+    Column(
+        "p95 (deg)",
+        lambda e: e.result.summary.settled_tilt_error_deg.p95,
+        lambda e: figure(e.result.summary.settled_tilt_error_deg.p95),
+    ),
+    Column(
+        "sharpest tolerance (×)",
+        lambda e: e.result.summary.settled_sharpest_95.scale,
+        lambda e: figure(e.result.summary.settled_sharpest_95.scale),
     ),
     Column(
         "ms per decision",
-        lambda r: r.timings.decision_ms,
-        lambda r: figure(r.timings.decision_ms),
+        lambda e: e.result.timings.decision_ms,
+        lambda e: figure(e.result.timings.decision_ms),
     ),
-    Column(
-        "scenarios",
-        lambda r: r.summary.n_episodes,
-        lambda r: str(r.summary.n_episodes),
-        larger_first=True,
-    ),
+    VERIFIED,
 )
+
+
+def make_entries(
+    submissions: Sequence[Submission], replays: Mapping[str, Replay] | None = None
+) -> list[Entry]:
+    """Returns what the board shows of checked results.
+
+    Args:
+        submissions: One a policy and task.
+        replays: What was played again, by ``<policy>/<task>``; nothing by default.
+    """
+    experts = {
+        entry.result.summary.task: entry.result
+        for entry in submissions
+        if entry.result.metadata.policy_kind == "builtin"
+        and entry.result.summary.policy == "expert"
+    }
+    entries = []
+    for entry in submissions:
+        replay = (replays or {}).get(f"{entry.path.parent.name}/{entry.path.stem}")
+        expert = experts.get(entry.result.summary.task)
+        entries.append(
+            Entry(
+                entry.path.parent.name,
+                entry.result,
+                replay.n_played if replay else 0,
+                None if expert is None else _steps_over(entry.result, expert),
+            )
+        )
+    return entries
 
 
 def by_task(entries: Sequence[Entry]) -> dict[str, list[Entry]]:
     """Returns the entries of each task, easiest task first, best entry first.
 
-    Equal success is decided by the median position error, then by name.
+    Equal success is decided by the settled position error, then by name.
     """
     tables: dict[str, list[Entry]] = {}
     names = list(TASKS)
@@ -118,49 +173,124 @@ def by_task(entries: Sequence[Entry]) -> dict[str, list[Entry]]:
         table.sort(
             key=lambda e: (
                 -e.result.summary.pc_success,
-                e.result.summary.position_error_mm.p50,
+                e.result.summary.settled_position_error_mm.iqm,
                 e.policy,
             )
         )
     return tables
 
 
-def overall(entries: Sequence[Entry]) -> dict[str, dict[str, Entry]]:
-    """Returns policy -> task -> entry, policies by their mean success over all tasks.
+@dataclasses.dataclass(frozen=True)
+class Overall:
+    """One policy over all tasks of the board.
 
-    A task that a policy was not scored on counts as 0 %, so that leaving out the hard ones does
-    not lift an entry; ties go by name.
+    Attributes:
+        policy: Name on the board.
+        entries: Its entries by task.
+        mean: Mean success over all tasks of the board (percent); a task it was not scored on
+            counts as 0 %, so that leaving out the hard ones does not lift it.
+        low: Lower end of the mean's 95 % interval (percent).
+        high: Upper end.
     """
+
+    policy: str
+    entries: Mapping[str, Entry]
+    mean: float
+    low: float
+    high: float
+
+
+def overall(entries: Sequence[Entry]) -> list[Overall]:
+    """Returns each policy over all tasks, the best mean first; ties go by name."""
     rows: dict[str, dict[str, Entry]] = {}
     for entry in sorted(entries, key=lambda e: (e.policy, e.task)):
         rows.setdefault(entry.policy, {})[entry.task] = entry
-    total = {
-        policy: sum(entry.result.summary.pc_success for entry in row.values())
-        for policy, row in rows.items()
-    }
-    return {policy: rows[policy] for policy in sorted(rows, key=lambda p: (-total[p], p))}
+    n_tasks = len({entry.task for entry in entries})
+    table = []
+    for policy, row in rows.items():
+        summaries = [entry.result.summary for entry in row.values()]
+        low, high = statistics.mean_rate_interval([(s.n_success, s.n_episodes) for s in summaries])
+        mean = sum(s.pc_success for s in summaries) / n_tasks
+        # What is missing is 0 % for certain: it lowers mean and interval alike.
+        scored = len(summaries) / n_tasks
+        table.append(Overall(policy, row, mean, low * scored, high * scored))
+    return sorted(table, key=lambda row: (-row.mean, row.policy))
+
+
+def describe(task: str) -> str:
+    """Returns what a task (its name, without version) asks for, in one line."""
+    v = registry.find(task)
+    bounds = [
+        (v.position_tolerance_mm, " mm"),
+        (v.lateral_tolerance_mm, " mm sideways"),
+        (v.height_tolerance_mm, " mm in height"),
+        (v.tilt_tolerance_deg, "°"),
+    ]
+    tolerance = ", ".join(f"{bound:g}{unit}" for bound, unit in bounds if bound is not None)
+    held = "" if v.hold_steps == 1 else f", held for {v.hold_steps} steps"
+    disturbances = [
+        name
+        for name, there in (
+            ("light", v.vary_light),
+            ("colour", v.vary_colour),
+            ("texture", v.vary_texture),
+            ("camera pose", v.eth_position_noise_m > 0),
+            ("image noise", v.image_noise > 0),
+            ("joint offsets", v.joint_offset_deg > 0),
+            ("latency", v.latency_steps > 0),
+        )
+        if there
+    ]
+    disturbed = f"Disturbed: {', '.join(disturbances)}" if disturbances else "Undisturbed"
+    start = {"zero": "from the zero pose", "random": "from anywhere"}.get(str(v.start), "")
+    return (
+        f"To within {tolerance}{held}, {start}, in {v.time_limit_steps} steps of "
+        f"{v.control_period_s:g} s. {disturbed}."
+    )
 
 
 def markdown(entries: Sequence[Entry]) -> str:
     """Returns the board as Markdown; the same entries give the same text."""
     tables = by_task(entries)
-    lines = ["# Leaderboard", "", NOTE, "", "## Success on all tasks", ""]
+    lines = [
+        "# Leaderboard",
+        "",
+        "`leaderboard.html` beside this file shows more: curves, landings, comparisons and clips. "
+        "[SUBMITTING.md](SUBMITTING.md) says how to add a policy.",
+        "",
+        NOTE,
+        "",
+        "## All tasks",
+        "",
+        "Mean success over all tasks; a task without a result counts as 0 %.",
+        "",
+    ]
     lines += _table(
-        ["policy", *tables],
+        ["policy", "mean", *tables],
         [
-            [policy, *(_cell(row.get(task)) for task in tables)]
-            for policy, row in overall(entries).items()
+            [
+                row.policy,
+                joined(percent(row.mean), interval(row.low, row.high)),
+                *(_cell(row.entries.get(task)) for task in tables),
+            ]
+            for row in overall(entries)
         ],
     )
     for task, table in tables.items():
-        split = table[0].result.summary.split
-        lines += ["", f"## {task}", "", f"First scenarios of the split `{_plain(split)}`.", ""]
+        summary = table[0].result.summary
+        lines += ["", f"## {task}", "", describe(summary.task)]
+        lines += [f"Split `{_plain(summary.split)}`.", ""]
         lines += _table(
             ["policy", *(column.title for column in COLUMNS)],
-            [[e.policy, *(column.text(e.result) for column in COLUMNS)] for e in table],
+            [[e.policy, *(joined(c.text(e), c.interval(e)) for c in COLUMNS)] for e in table],
         )
     lines += ["", "Written by `hvs leaderboard` from the result files; do not edit.", ""]
     return "\n".join(lines)
+
+
+def share(entry: Entry, count: int) -> float:
+    """Returns a count of episodes as percent of all."""
+    return 100 * count / entry.result.summary.n_episodes
 
 
 def percent(value: float) -> str:
@@ -168,27 +298,47 @@ def percent(value: float) -> str:
     return f"{value:.1f}".removesuffix(".0") + " %"
 
 
-def interval(result: Result) -> str:
-    """Returns the interval of the success rate, such as ``23.1-88.2 %``."""
-    low, high = result.summary.pc_success_ci95
-    return f"{low:.1f}\N{EN DASH}{high:.1f} %"
+def interval(low: float, high: float) -> str:
+    """Returns an interval of percentages, such as ``23.1-88.2 %``."""
+    return f"{low:.1f}{DASH}{high:.1f} %"
+
+
+def iqm_interval(summary: SettledErrorSummary) -> str:
+    """Returns the interval of an interquartile mean; empty where its ends read the same."""
+    low, high = (figure(end) for end in summary.iqm_ci95)
+    return "" if low == high else f"{low}{DASH}{high}"
+
+
+def joined(text: str, interval: str) -> str:
+    """Returns a figure with its interval in brackets, as far as it has one."""
+    return f"{text} ({interval})" if interval else text
 
 
 def figure(value: float | None) -> str:
     """Returns a number with two or three significant digits; a dash for None."""
     if value is None:
-        return "\N{EN DASH}"
-    if 0 < value < 0.005:
-        return "< 0.01"
+        return DASH
+    if 0 < value < 0.0005:
+        return "< 0.001"
     if value >= 100:
         return f"{value:.0f}"
-    return f"{value:.2f}" if value < 10 else f"{value:.1f}"
+    if value >= 10:
+        return f"{value:.1f}"
+    return f"{value:.2f}" if value >= 0.1 or value == 0 else f"{value:.3f}"
+
+
+def _steps_over(result: Result, expert: Result) -> float | None:
+    theirs = {row.scenario: row.steps for row in expert.episodes if row.success}
+    both = [row for row in result.episodes if row.success and row.scenario in theirs]
+    if not both:
+        return None
+    return sum(row.steps for row in both) / sum(theirs[row.scenario] for row in both)
 
 
 def _cell(entry: Entry | None) -> str:
     if entry is None:
-        return "\N{EN DASH}"
-    return f"{percent(entry.result.summary.pc_success)} ({interval(entry.result)})"
+        return DASH
+    return joined(SUCCESS.text(entry), SUCCESS.interval(entry))
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

@@ -100,6 +100,49 @@ class Comparison:
         )
 
 
+@dataclasses.dataclass(frozen=True)
+class Tally:
+    """On how many scenarios two policies, A and B, succeeded.
+
+    Attributes:
+        n_both: Solved by both.
+        n_only_a: Solved by A alone.
+        n_only_b: Solved by B alone.
+        n_neither: Solved by neither.
+    """
+
+    n_both: int
+    n_only_a: int
+    n_only_b: int
+    n_neither: int
+
+    @classmethod
+    def of(cls, a: Mapping[int, bool], b: Mapping[int, bool]) -> "Tally":
+        """Counts the scenarios that both played.
+
+        Args:
+            a: Outcome of A by scenario.
+            b: Outcome of B by scenario.
+        """
+        pairs = [(a[index], b[index]) for index in a.keys() & b.keys()]
+        return cls(
+            n_both=pairs.count((True, True)),
+            n_only_a=pairs.count((True, False)),
+            n_only_b=pairs.count((False, True)),
+            n_neither=pairs.count((False, False)),
+        )
+
+    @property
+    def n(self) -> int:
+        """Scenarios that both played."""
+        return self.n_both + self.n_only_a + self.n_only_b + self.n_neither
+
+    @property
+    def p(self) -> float:
+        """Two-sided p-value of McNemar's exact test."""
+        return statistics.mcnemar(self.n_only_a, self.n_only_b)
+
+
 def compare(first: Path, second: Path) -> Comparison:
     """Compares two results of the same task on the scenarios that both played.
 
@@ -123,8 +166,7 @@ def compare(first: Path, second: Path) -> Comparison:
     common = sorted(a.success.keys() & b.success.keys())
     if not common:
         raise ResultError(f"{first} and {second} have no scenario in common")
-    pairs = [(a.success[index], b.success[index]) for index in common]
-    only_a, only_b = pairs.count((True, False)), pairs.count((False, True))
+    tally = Tally.of(a.success, b.success)
     rows = [(a.rows[i], b.rows[i]) for i in common if i in a.rows and i in b.rows]
     steps = [(ours.steps, theirs.steps) for ours, theirs in rows if ours.success and theirs.success]
     names = (a.name, b.name) if a.name != b.name else (f"{a.name} (A)", f"{b.name} (B)")
@@ -133,13 +175,11 @@ def compare(first: Path, second: Path) -> Comparison:
         a=names[0],
         b=names[1],
         n=len(common),
-        n_both=pairs.count((True, True)),
-        n_only_a=only_a,
-        n_only_b=only_b,
-        n_neither=pairs.count((False, False)),
-        p=statistics.mcnemar(only_a, only_b),
+        **dataclasses.asdict(tally),
+        p=tally.p,
         success=statistics.paired_difference(
-            [100.0 * ours for ours, _ in pairs], [100.0 * theirs for _, theirs in pairs]
+            [100.0 * a.success[index] for index in common],
+            [100.0 * b.success[index] for index in common],
         ),
         settled_position_mm=_difference(rows, "settled_position_error_mm"),
         settled_tilt_deg=_difference(rows, "settled_tilt_error_deg"),

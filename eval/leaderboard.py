@@ -1,48 +1,72 @@
 """Builds the board from result files: Markdown, and one web page that needs no network.
 
 Run as ``python eval/leaderboard.py`` or ``hvs leaderboard``. Results lie as
-``<results>/<policy>/<task>.json``; one that is malformed, a duplicate, or made with another version
-of its task stops the build with the reason, because a board is only as good as its worst row.
+``<results>/<policy>/<task>.json`` with their action logs beside them. One that is malformed,
+altered, a duplicate, made with another version of its task, or does not come out again when its
+actions are played stops the build with the reason: a board is only as good as its worst row.
+
+Equal results give equal bytes, on any machine, as long as ``clips`` and ``verified.json`` stay
+beside the board: what was drawn and played once is not drawn and played again.
 """
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from hvs_suite import files, registry
+from hvs_suite import files
 from hvs_suite.errors import HvsError, ResultError
-from hvs_suite.eval import result_file
+from hvs_suite.eval import board_clips, board_replays, result_file, submission
 from hvs_suite.eval.board_page import page
-from hvs_suite.eval.board_tables import Entry, markdown
+from hvs_suite.eval.board_tables import make_entries, markdown
+from hvs_suite.eval.submission import Submission
+from hvs_suite.eval.verification import check_task
 
 RESULTS = Path("eval/results")
 OUT = Path("eval")
 
 
-def build(results_folder: Path = RESULTS, out: Path = OUT) -> tuple[Path, Path]:
-    """Writes ``LEADERBOARD.md`` and ``leaderboard.html``; equal results give equal bytes.
+def build(
+    results_folder: Path = RESULTS,
+    out: Path = OUT,
+    *,
+    replay: int = board_replays.SAMPLE,
+    say: Callable[[str], None] = lambda line: None,
+) -> tuple[Path, Path]:
+    """Writes ``LEADERBOARD.md`` and ``leaderboard.html``, and what a rebuild needs beside them.
 
     Args:
         results_folder: Holds ``<policy>/<task>.json``.
         out: Folder to write to; made if missing.
+        replay: Scenarios of each new result to play again, drawn by the file's hash; a number that
+            a result does not have plays all of it.
+        say: Told what takes time.
 
     Returns:
         The two files.
 
     Raises:
-        ResultError: A result is refused, or there is none; nothing is written.
+        ResultError: A result is refused, or there is none; the board stays as it was.
+        OptionError: `replay` is below 1.
         OutputError: A file cannot be written.
+        RenderError: A clip is to be drawn and nothing here can.
     """
-    entries = collect(results_folder)
+    submissions = collect(results_folder)
     written = out / "LEADERBOARD.md", out / "leaderboard.html"
-    for path, text in zip(written, (markdown(entries), page(entries)), strict=True):
+    for path in written:
+        files.check_writable(path)
+    ledger = out / board_replays.LEDGER
+    replays = board_replays.check(submissions, ledger, sample=replay, say=say)
+    entries = make_entries(submissions, replays)
+    clips = board_clips.clips(submissions, out / board_clips.FOLDER, say)
+    board_replays.write(ledger, replays)
+    for path, text in zip(written, (markdown(entries), page(entries, clips)), strict=True):
         with files.replacing(path) as temporary:
             temporary.write_text(text, encoding="utf-8", newline="\n")
     return written
 
 
-def collect(results_folder: Path) -> list[Entry]:
+def collect(results_folder: Path) -> list[Submission]:
     """Reads every result of a folder and refuses what does not belong on one board.
 
     Raises:
@@ -55,59 +79,15 @@ def collect(results_folder: Path) -> list[Entry]:
             f"there are no results below {results_folder}; make one with 'hvs evaluate ... --out "
             f"{results_folder}/<policy>/<task>.json'"
         )
-    entries: list[Entry] = []
-    places: dict[Path, Entry] = {}
+    found: list[Submission] = []
     for path in paths:
-        policy, *rest = path.relative_to(results_folder).parts
-        if len(rest) != 1:
-            raise ResultError(f"{path}: results lie as {results_folder}/<policy>/<task>.json")
-        entry = Entry(policy, result_file.load(path))
-        variant = registry.find(entry.result.summary.task)
-        if entry.result.metadata.task_version != variant.version:
-            raise ResultError(
-                f"{path}: played on {entry.task}, but this hvs_suite has v{variant.version}; "
-                "evaluate again"
-            )
-        if path.stem != entry.result.summary.task:
-            raise ResultError(
-                f"{path}: the file is named after one task, but holds a result of "
-                f"{entry.result.summary.task}; rename it"
-            )
-        if entry.result.metadata.options:
-            options = ", ".join(sorted(entry.result.metadata.options))
-            raise ResultError(
-                f"{path}: the task was changed ({options}); only the task as named is scored"
-            )
-        for earlier_path, earlier in places.items():
-            _check_pair(path, entry, earlier_path, earlier)
-        places[path] = entry
-        entries.append(entry)
-    return entries
-
-
-def _check_pair(path: Path, entry: Entry, earlier_path: Path, earlier: Entry) -> None:
-    """Refuses two results that cannot stand on the same board."""
-    ours, theirs = entry.result, earlier.result
-    if ours.summary.task != theirs.summary.task:
-        return
-    for what, mine, other in (
-        ("task_digest", ours.metadata.task_digest, theirs.metadata.task_digest),
-        ("split", ours.summary.split, theirs.summary.split),
-    ):
-        if mine != other:
-            raise ResultError(
-                f"{path}: {what} is {mine!r}, but {other!r} in {earlier_path}; evaluate both with "
-                "the same version on the same split"
-            )
-    # Timings differ between two runs of the same thing, the rows of one policy do not.
-    if (
-        ours.summary.policy == theirs.summary.policy
-        and ours.metadata.policy_hash == theirs.metadata.policy_hash
-    ):
-        raise ResultError(
-            f"{path}: duplicate of {earlier_path}: policy {ours.summary.policy} on the same task; "
-            "remove one"
-        )
+        entry = Submission(path, result_file.load(path))
+        submission.check_place(entry, results_folder)
+        check_task(path, entry.result)
+        for earlier in found:
+            submission.check_pair(entry, earlier)
+        found.append(entry)
+    return found
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -122,14 +102,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--out", type=Path, default=OUT, help="folder to write the board to (default: %(default)s)"
     )
+    parser.add_argument(
+        "--replay",
+        type=int,
+        default=board_replays.SAMPLE,
+        help="scenarios of each new result to play again; 1000 plays all (default: %(default)s)",
+    )
     options = parser.parse_args(arguments)
     try:
-        for path in build(options.results, options.out):
+        for path in build(options.results, options.out, replay=options.replay, say=_say):
             print(path)
     except HvsError as error:
         print(f"leaderboard: {error}", file=sys.stderr)
         return 2
     return 0
+
+
+def _say(line: str) -> None:
+    print(f"leaderboard: {line}", file=sys.stderr)
 
 
 if __name__ == "__main__":

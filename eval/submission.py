@@ -51,21 +51,59 @@ def check(paths: Iterable[Path], results: Path) -> list[Submission]:
     ]
     submissions = [entry for entry in standing if entry.path.resolve() in wanted]
     for entry in submissions:
-        _check_place(entry, results)
+        check_place(entry, results)
+        _check_score(entry)
         check_task(entry.path, entry.result)
         _check_metadata(entry)
         for other in standing:
             if other is not entry:
-                _check_pair(entry, other)
+                check_pair(entry, other)
     return submissions
 
 
-def _check_place(entry: Submission, results: Path) -> None:
+def check_place(entry: Submission, results: Path) -> None:
+    """Checks that a result lies where its policy and task say.
+
+    Raises:
+        ResultError: It does not.
+    """
     path, summary = entry.path, entry.result.summary
     if len(path.relative_to(results).parts) != 2:
         raise ResultError(f"{path}: results lie as {results}/<policy>/<task>.json")
     if path.stem != summary.task:
         raise ResultError(f"{path}: holds a result of {summary.task}; name it {summary.task}.json")
+
+
+def check_pair(entry: Submission, other: Submission) -> None:
+    """Checks that two results can stand on one board.
+
+    Raises:
+        ResultError: Both are of one task, and of another version or split of it, or are one result
+            twice.
+    """
+    ours, theirs = entry.result, other.result
+    if ours.summary.task != theirs.summary.task:
+        return
+    for name in ("task_version", "task_digest"):
+        if getattr(ours.metadata, name) != getattr(theirs.metadata, name):
+            raise ResultError(
+                f"{entry.path}: {name} differs from {other.path}; one board holds one version"
+            )
+    if ours.summary.split != theirs.summary.split:
+        raise ResultError(
+            f"{entry.path}: split is {ours.summary.split!r}, but {theirs.summary.split!r} in "
+            f"{other.path}; evaluate both on the same split"
+        )
+    same_policy = (ours.summary.policy, ours.metadata.policy_hash) == (
+        theirs.summary.policy,
+        theirs.metadata.policy_hash,
+    )
+    if same_policy or ours.metadata.actions_sha256 == theirs.metadata.actions_sha256:
+        raise ResultError(f"{entry.path}: duplicate of {other.path}; remove one")
+
+
+def _check_score(entry: Submission) -> None:
+    path, summary = entry.path, entry.result.summary
     if summary.split != TEST_SPLIT:
         raise ResultError(
             f"{path}: split is {summary.split!r}; a score is played on {TEST_SPLIT!r}"
@@ -90,20 +128,3 @@ def _check_metadata(entry: Submission) -> None:
             missing.append(name)
     if missing:
         raise ResultError(f"{path}: metadata lacks {', '.join(missing)}; evaluate again")
-
-
-def _check_pair(entry: Submission, other: Submission) -> None:
-    ours, theirs = entry.result, other.result
-    if ours.summary.task != theirs.summary.task:
-        return
-    for name in ("task_version", "task_digest"):
-        if getattr(ours.metadata, name) != getattr(theirs.metadata, name):
-            raise ResultError(
-                f"{entry.path}: {name} differs from {other.path}; one board holds one version"
-            )
-    same_policy = (ours.summary.policy, ours.metadata.policy_hash) == (
-        theirs.summary.policy,
-        theirs.metadata.policy_hash,
-    )
-    if same_policy or ours.metadata.actions_sha256 == theirs.metadata.actions_sha256:
-        raise ResultError(f"{entry.path}: duplicate of {other.path}; remove one")

@@ -52,6 +52,39 @@ def wilson_interval(n_success: int, n_total: int, confidence: float = 0.95) -> t
     return 100 * low, 100 * high
 
 
+def mean_rate_interval(
+    counts: Sequence[tuple[int, int]], confidence: float = 0.95
+) -> tuple[float, float]:
+    """Returns an interval for the unweighted mean of independent success rates.
+
+    With rates p_i and their Wilson intervals [l_i, u_i], the k rates' mean m has the interval
+    ``m - sqrt(sum (p_i - l_i)^2) / k`` to ``m + sqrt(sum (u_i - p_i)^2) / k``. One rate has its
+    Wilson interval.
+
+    Source: G. Y. Zou, W. Huang and X. Zhang, "A note on confidence interval estimation for a linear
+    function of binomial proportions", Computational Statistics & Data Analysis 53 (2009) 1080-1085.
+
+    Args:
+        counts: Successes and trials of each rate, one or more.
+        confidence: Coverage aimed at, in (0, 1).
+
+    Returns:
+        Lower and upper end (percent).
+
+    Raises:
+        ValueError: There is no rate, counts are not those of trials, or `confidence` is outside
+            (0, 1).
+    """
+    if not counts:
+        raise ValueError("Give one or more rates.")
+    rates = [100 * n_success / n_total for n_success, n_total in counts]
+    intervals = [wilson_interval(*count, confidence) for count in counts]
+    mean = math.fsum(rates) / len(rates)
+    below = math.hypot(*(p - low for p, (low, _) in zip(rates, intervals, strict=True)))
+    above = math.hypot(*(high - p for p, (_, high) in zip(rates, intervals, strict=True)))
+    return max(0.0, mean - below / len(rates)), min(100.0, mean + above / len(rates))
+
+
 def interquartile_mean(values: npt.ArrayLike) -> float:
     """Returns the mean of the middle half: a quarter of the values is cut off at each end.
 
@@ -202,6 +235,35 @@ def mcnemar(n_only_first: int, n_only_second: int) -> float:
     tail = sum(math.comb(n, k) for k in range(min(n_only_first, n_only_second) + 1))
     # Whole numbers until the end: 2**n overflows a float from n = 1,024 on.
     return min(1.0, 2 * tail / 2**n)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Returns p-values corrected for having tested them all together.
+
+    The i-th smallest of m is multiplied by m - i + 1, and none may fall below a smaller one's.
+    Calling those below 0.05 significant is then wrong about any of them with probability 0.05 at
+    most, however they depend on each other.
+
+    Source: S. Holm, "A simple sequentially rejective multiple test procedure", Scandinavian Journal
+    of Statistics 6 (1979) 65-70.
+
+    Args:
+        p_values: (m,) in [0, 1].
+
+    Returns:
+        (m,) in the same order, each at least as large as it was.
+
+    Raises:
+        ValueError: A value is no probability.
+    """
+    if not all(0.0 <= p <= 1.0 for p in p_values):
+        raise ValueError("p-values lie between 0 and 1.")
+    corrected = [0.0] * len(p_values)
+    floor = 0.0
+    for rank, index in enumerate(sorted(range(len(p_values)), key=p_values.__getitem__)):
+        floor = max(floor, min(1.0, (len(p_values) - rank) * p_values[index]))
+        corrected[index] = floor
+    return corrected
 
 
 def share_within(errors: npt.ArrayLike, tolerances: npt.ArrayLike) -> FloatArray:

@@ -3,105 +3,301 @@
 import html.parser
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
-from test_result_file import make_result
+from test_result_file import make_result, row
 
-from hvs_suite.errors import OutputError, ResultError
-from hvs_suite.eval import board_tables, leaderboard, result_file
+from hvs_suite.errors import OptionError, OutputError, ResultError
+from hvs_suite.eval import (
+    board_clips,
+    board_matrix,
+    board_plots,
+    board_replays,
+    board_tables,
+    leaderboard,
+    protocol,
+    result_file,
+)
+from hvs_suite.eval.board_page import page
+from hvs_suite.eval.board_tables import Entry
 
 ROOT = Path(__file__).parents[2]
+COMMITTED = ROOT / "eval"
 
 
-def add(folder: Path, policy: str, task: str, n: int = 5, **metadata: Any) -> Path:
-    result = make_result(n, policy=metadata.pop("spec", policy), task=task)
-    split = metadata.pop("split", "test")
-    result = result.model_copy(
-        update={
-            "metadata": result.metadata.model_copy(update=metadata),
-            "summary": result.summary.model_copy(update={"split": split}),
-        }
-    )
-    path = folder / policy / f"{task}.json"
-    result_file.write(result, path)
-    return path
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    folder = tmp_path / "results"
-    add(folder, "zero", "align-easy", n=9)
-    add(folder, "expert", "align-easy", n=3)
-    add(folder, "expert", "align-thesis", n=4)
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Real results, with their action logs, and the board of them."""
+    folder = tmp_path_factory.mktemp("made")
+    for policy, task, n in (
+        ("expert", "align-fixed", 3),
+        ("zero", "align-fixed", 3),
+        ("expert", "align-easy", 2),
+    ):
+        path = folder / "results" / policy / f"{task}.json"
+        protocol.evaluate(policy, task, path, episodes=n)
+    leaderboard.build(folder / "results", folder / "out", replay=1)
     return folder
 
 
-def test_markdown_holds_a_row_for_each_result_best_first(folder: Path, tmp_path: Path) -> None:
-    board, _ = leaderboard.build(folder, tmp_path / "out")
-    text = board.read_text()
-    easy = text.partition("## align-easy-v1")[2].partition("## ")[0]
-    assert [line.split(" | ")[0] for line in easy.splitlines() if line.startswith("| ")] == [
+@pytest.fixture
+def folder(made: Path, tmp_path: Path) -> Path:
+    """A copy of them: ``results`` and ``out``."""
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    return tmp_path
+
+
+def build(folder: Path, **options: Any) -> tuple[Path, Path]:
+    return leaderboard.build(folder / "results", folder / "out", **options)
+
+
+def content_of(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def alter(path: Path, split: str = "test", **metadata: Any) -> None:
+    """Changes a result and seals it anew."""
+    result = result_file.load(path)
+    changed = {
+        "metadata": result.metadata.model_copy(update=metadata),
+        "summary": result.summary.model_copy(update={"split": split}),
+    }
+    result_file.write(result.model_copy(update=changed), path)
+
+
+def made_up(policy: str, n: int = 5, task: str = "align-easy") -> Entry:
+    return Entry(policy, make_result(n, policy=policy, task=task), 2)
+
+
+def test_markdown_holds_a_row_for_each_result_best_first(made: Path) -> None:
+    text = (made / "out" / "LEADERBOARD.md").read_text()
+    fixed = text.partition("## align-fixed-v1")[2].partition("## ")[0]
+    assert [line.split(" | ")[0] for line in fixed.splitlines() if line.startswith("| ")] == [
         "| policy",
         "| expert",
         "| zero",
     ]
-    assert "| expert | 100 % | 43.9–100.0 % | 0 % |" in easy
-    assert "| expert | 100 % (43.9–100.0 %) | 75 % (30.1–95.4 %) |" in text
-    assert "| zero | 33.3 % (12.1–64.6 %) | – |" in text
+    assert "| expert | 100 % (43.9–100.0 %) | 0 % |" in fixed
+    assert fixed.count("| 1 of 3 |") == 2
+    # The mean's interval is narrower than either task's; who left a task out counts 0 % for it.
+    assert re.search(r"\| expert \| 100 % \(5\d\.\d–100.0 %\) \| 100 % \(43\.9–100\.0 %\) \|", text)
+    assert "| zero | 0 % (0.0–28.1 %) | 0 % (0.0–56.1 %) | – |" in text
 
 
-def test_equal_results_give_equal_bytes(folder: Path, tmp_path: Path) -> None:
-    first = [path.read_bytes() for path in leaderboard.build(folder, tmp_path / "one")]
-    second = [path.read_bytes() for path in leaderboard.build(folder, tmp_path / "two")]
-    assert first == second
-
-
-def test_the_page_is_well_formed_and_asks_the_network_for_nothing(
-    folder: Path, tmp_path: Path
+def test_a_rebuild_changes_nothing_and_draws_nothing(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    before = content_of(folder)
+    monkeypatch.setattr(board_clips, "_draw", None)
+    monkeypatch.setattr(board_replays.verification, "verify", None)
+    build(folder, replay=1)
+    assert content_of(folder) == before
+
+
+def test_clips_show_the_middle_success_and_the_middle_failure() -> None:
+    rows = [row(k, success=k != 3 and k < 5, error=float(k)) for k in range(8)]
+    result = make_result().model_copy(update={"episodes": rows})
+    assert [(kind, r.scenario) for kind, r in board_clips.choose(result)] == [
+        ("success", 1),
+        ("failure", 5),
+    ]
+
+
+def test_each_entry_has_the_clips_it_can_have(made: Path) -> None:
+    from PIL import Image
+
+    clips = sorted((made / "out" / "clips").rglob("*.avif"))
+    assert [path.name.rpartition(".")[0].rpartition(".")[0] for path in clips] == [
+        "align-easy.success",
+        "align-fixed.success",
+        "align-fixed.failure",
+    ]
+    with Image.open(clips[0]) as film:
+        assert film.size == board_clips.SIZE
+        assert film.n_frames == 21
+        # The arm moves: first and last frame are not the same picture.
+        first = film.convert("RGB").tobytes()
+        film.seek(20)
+        assert film.convert("RGB").tobytes() != first
+    assert all(path.stat().st_size < 30_000 for path in clips)
+
+
+def test_a_clip_that_belongs_to_no_result_is_removed(folder: Path) -> None:
+    shutil.rmtree(folder / "results" / "zero")
+    build(folder, replay=1)
+    assert not (folder / "out" / "clips" / "zero").exists()
+    assert "zero" not in json.loads((folder / "out" / "verified.json").read_text())
+
+
+def test_more_scenarios_are_played_when_more_are_asked_for(folder: Path) -> None:
+    said: list[str] = []
+    build(folder, replay=2, say=said.append)
+    # Both scenarios of align-easy are played now, and two of three of the others.
+    assert sum("playing 2 scenarios" in line for line in said) == 3
+    ledger = json.loads((folder / "out" / "verified.json").read_text())
+    assert ledger["expert/align-easy"]["n_played"] == 2
+    text = (folder / "out" / "LEADERBOARD.md").read_text()
+    assert "| all 2 |" in text
+    said.clear()
+    build(folder, replay=1, say=said.append)
+    assert said == []
+
+
+def test_at_least_one_scenario_is_played(folder: Path) -> None:
+    with pytest.raises(OptionError, match="at least 1"):
+        build(folder, replay=0)
+
+
+def test_the_page_is_well_formed_and_asks_the_network_for_nothing(made: Path) -> None:
     class Checker(html.parser.HTMLParser):
-        open_tags: list[str] = []  # noqa: RUF012
+        def __init__(self) -> None:
+            super().__init__()
+            self.open_tags: list[str] = []
+            self.identities: list[str] = []
 
         def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-            assert not {"src", "href"} & {name for name, _ in attrs}
-            if tag not in ("meta", "br"):
+            given = {name: value or "" for name, value in attrs}
+            assert given.get("href", "#").startswith("#")
+            assert given.get("src", "data:image/avif;base64,").startswith("data:image/avif;base64,")
+            if "id" in given:
+                self.identities.append(given["id"])
+            if tag not in ("meta", "br", "img", "input"):
                 self.open_tags.append(tag)
 
         def handle_startendtag(self, tag: str, attrs: Any) -> None:
-            assert tag == "rect"
+            assert tag in ("rect", "path", "circle")
 
         def handle_endtag(self, tag: str) -> None:
             assert self.open_tags.pop() == tag
 
-    _, page = leaderboard.build(folder, tmp_path)
+    text = (made / "out" / "leaderboard.html").read_text()
     checker = Checker()
-    checker.feed(page.read_text())
+    checker.feed(text)
     assert checker.open_tags == []
-    assert not re.search(r"https?:|@import|url\(", page.read_text())
+    assert len(set(checker.identities)) == len(checker.identities)
+    assert not re.search(r"https?:|@import|url\(", text)
+    assert text.count("data:image/avif;base64,") == 3
 
 
-def test_the_interval_is_drawn_to_scale(folder: Path, tmp_path: Path) -> None:
-    _, page = leaderboard.build(folder, tmp_path)
+def test_the_page_says_how_to_submit(made: Path) -> None:
+    text = (made / "out" / "leaderboard.html").read_text()
+    assert "<h2>Submitting a result</h2>" in text
+    assert "hvs verify --submission" in text
+
+
+def test_the_interval_is_drawn_to_scale() -> None:
     low, high = make_result(4).summary.pc_success_ci95
-    assert f'x="{low:.2f}" y="3" width="{high - low:.2f}"' in page.read_text()
+    assert f'x="{low:.2f}" y="3" width="{high - low:.2f}"' in page([made_up("a", 4)])
 
 
-def test_a_hostile_name_stays_text(tmp_path: Path) -> None:
-    name = "<img onerror=alert(1)>|"
-    add(tmp_path / "results", name, "align-easy")
-    board, page = leaderboard.build(tmp_path / "results", tmp_path)
-    assert "<img" not in page.read_text()
-    assert "<img" not in board.read_text()
-    assert "(1)&#62;&#124; |" in board.read_text()
+def test_a_page_of_six_tasks_and_eight_policies_stays_small() -> None:
+    rows = [
+        row(k % 8, success=k % 2 == 0, error=1.0 + k % 7).model_copy(
+            update={"scenario": k, "settled_x_mm": k * 0.01, "settled_y_mm": -k * 0.017}
+        )
+        for k in range(1000)
+    ]
+    # Clips add 12 kB each, 1.6 MB for two of every entry.
+    entries = [
+        Entry(
+            f"policy-{k}", made_up("p", task=task).result.model_copy(update={"episodes": rows}), 9
+        )
+        for task in board_tables.TASKS
+        for k in range(8)
+    ]
+    assert len(page(entries)) < 2_000_000
+
+
+def test_the_curve_of_tolerance_is_the_rows_own() -> None:
+    entry = made_up("a")
+    plot = board_plots.tolerance_plot([entry], {"a": 0})
+    # Four of five settle somewhere; the fifth collided, and no tolerance makes that a success.
+    [line] = re.findall(r'class="line" d="M([^"]*)"', plot)
+    x, y = (float(part) for part in line.split("L")[-1].split())
+    assert (x, y) == (346.0, pytest.approx(192 - 0.8 * 182, abs=0.06))
+
+
+def test_landings_stand_where_the_flange_stood() -> None:
+    rows = [
+        row(0, success=True, error=1.0, settled_x_mm=5.0, settled_y_mm=2.5),
+        row(2, success=False, error=9.0, settled_x_mm=-90.0, settled_y_mm=0.0),
+        row(3, success=False, error=9.0, settled_x_mm=0.0, settled_y_mm=-10.0),
+    ]
+    plot = board_plots.landing_plot(rows, 10.0, 5.0, "landings")
+    assert '<path class="hit" d="M150 75h0"/>' in plot
+    assert '<path class="lost" d="M100 200h0"/>' in plot
+    assert 'class="miss"' not in plot
+    assert '<circle class="goal" cx="100" cy="100" r="50.0"/>' in plot
+
+
+@pytest.mark.parametrize(("error", "radius"), [(0.0, 0.001), (0.9, 1), (1.1, 2), (430.0, 500)])
+def test_the_landing_picture_has_a_round_size(error: float, radius: float) -> None:
+    rows = [row(k, success=False, error=error, settled_x_mm=error) for k in range(5)]
+    assert board_plots.landing_radius(rows) == pytest.approx(radius)
+
+
+def test_the_comparison_is_paired_and_corrected() -> None:
+    def entry(policy: str, wins: int) -> Entry:
+        rows = [
+            row(
+                k,
+                success=k < wins,
+                error=1.0,
+                steps=9,
+                steps_to_goal=9 if k < wins else None,
+                settled_steps=9,
+                n_clipped=0,
+            )
+            for k in range(20)
+        ]
+        return Entry(policy, make_result().model_copy(update={"episodes": rows}), 1)
+
+    table = board_matrix.matrix([entry("a", 20), entry("b", 11), entry("c", 10)])
+    # a against b: nine discordant pairs, p = 2/2^9, times 2 by Holm; b against c: one pair.
+    assert "+45.0<small>p = 0.008</small>" in table
+    assert "\N{MINUS SIGN}45.0<small>p = 0.008</small>" in table
+    assert "+5.0<small>p = 1.00</small>" in table
+    assert 'title="a alone solves 9, b alone 0, both 11, neither 0 of 20"' in table
+    assert (table.count('"better"'), table.count('"worse"'), table.count('"even"')) == (2, 2, 2)
+
+
+def test_steps_are_compared_with_the_experts_on_what_both_solve(made: Path) -> None:
+    entries = board_tables.make_entries(leaderboard.collect(made / "results"))
+    assert [(e.policy, e.steps_over_expert) for e in entries] == [
+        ("expert", 1.0),
+        ("expert", 1.0),
+        ("zero", None),
+    ]
+
+
+def test_a_hostile_name_stays_text() -> None:
+    name = '<img onerror=alert(1)>|"'
+    entries = [made_up(name), made_up("other")]
+    assert "<img" not in page(entries)
+    assert "<img" not in board_tables.markdown(entries)
+    assert "(1)&#62;&#124;" in board_tables.markdown(entries)
 
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(None, "–"), (0.0, "0.00"), (4e-5, "< 0.01"), (0.25, "0.25"), (12.34, "12.3"), (390.4, "390")],
+    [
+        (None, "–"),
+        (0.0, "0.00"),
+        (4e-5, "< 0.001"),
+        (0.025, "0.025"),
+        (0.25, "0.25"),
+        (12.34, "12.3"),
+        (390.4, "390"),
+    ],
 )
 def test_figures_keep_the_digits_that_matter(value: float | None, text: str) -> None:
     assert board_tables.figure(value) == text
@@ -112,77 +308,167 @@ def test_no_results_say_how_to_make_one(tmp_path: Path) -> None:
         leaderboard.build(tmp_path / "none", tmp_path)
 
 
-def test_one_bad_result_stops_the_build_and_leaves_the_old_board(
-    folder: Path, tmp_path: Path
-) -> None:
-    board, page = leaderboard.build(folder, tmp_path / "out")
-    before = board.read_bytes(), page.read_bytes()
-    path = add(folder, "servo", "align-easy")
+def flattered_summary(results: Path) -> str:
+    path = results / "zero" / "align-fixed.json"
     content = json.loads(path.read_text())
-    content["summary"]["n_success"] = 5
+    content["summary"]["n_success"] = 3
     path.write_text(json.dumps(content))
-    with pytest.raises(ResultError, match=r"servo/align-easy\.json: summary\.n_success"):
-        leaderboard.build(folder, tmp_path / "out")
-    assert (board.read_bytes(), page.read_bytes()) == before
+    return r"zero/align-fixed\.json: summary\.n_success"
+
+
+def not_json(results: Path) -> str:
+    (results / "zero" / "align-fixed.json").write_text("{")
+    return "is not JSON"
+
+
+def another_version(results: Path) -> str:
+    alter(results / "zero" / "align-fixed.json", task_version=2)
+    return "task_version is 2, but 1 for align-fixed"
+
+
+def another_digest(results: Path) -> str:
+    alter(results / "zero" / "align-fixed.json", task_digest="other")
+    return "task_digest is other"
+
+
+def another_split(results: Path) -> str:
+    alter(results / "zero" / "align-fixed.json", split="train")
+    return "split is 'train'|split is 'test'"
+
+
+def changed_task(results: Path) -> str:
+    alter(results / "zero" / "align-fixed.json", options={"hold_steps": 2})
+    return r"task was changed \(hold_steps\)"
+
+
+def duplicate(results: Path) -> str:
+    shutil.copytree(results / "expert", results / "mine")
+    return r"duplicate of .*expert"
+
+
+def stolen_actions(results: Path) -> str:
+    shutil.copytree(results / "expert", results / "mine")
+    for path in (results / "mine").glob("*.json"):
+        alter(path, policy_hash="mine")
+    return r"duplicate of .*expert"
+
+
+def another_name(results: Path) -> str:
+    path = results / "zero" / "align-fixed.json"
+    path.rename(path.with_name("align-hard.json"))
+    return "name it align-fixed.json"
+
+
+def too_high(results: Path) -> str:
+    shutil.copy(results / "zero" / "align-fixed.json", results / "align-fixed.json")
+    return "results lie as"
+
+
+def no_log(results: Path) -> str:
+    (results / "zero" / "align-fixed.actions.npz").unlink()
+    return "the action log cannot be read"
+
+
+def another_log(results: Path) -> str:
+    name = "align-fixed.actions.npz"
+    shutil.copy(results / "expert" / name, results / "zero" / name)
+    return "is not the action log"
+
+
+def flattered_row(results: Path) -> str:
+    """A row, summary and seal that agree with each other, and not with the actions."""
+    path = results / "zero" / "align-fixed.json"
+    result = result_file.load(path)
+    rows = [
+        r.model_copy(update={name: 1.0 for name in vars(r) if "_error_" in name})
+        for r in result.episodes
+    ]
+    summary = result_file.Summary.of(
+        "align-fixed",
+        "zero",
+        "test",
+        rows,
+        tolerances=result.metadata.tolerances,
+        time_limit_steps=result.metadata.time_limit_steps,
+    )
+    result_file.write(result.model_copy(update={"episodes": rows, "summary": summary}), path)
+    return r"position_error_mm is 1\.0, but the logged actions give"
 
 
 @pytest.mark.parametrize(
-    ("metadata", "reason"),
+    "spoil",
     [
-        ({"task_version": 2}, "align-easy-v2, but this hvs_suite has v1"),
-        ({"task_digest": "other"}, "task_digest is"),
-        ({"split": "train"}, "split is"),
-        ({"options": {"hold_steps": 1}}, r"task was changed \(hold_steps\)"),
-        ({"spec": "zero"}, "duplicate of .*align-easy.json"),
+        flattered_summary,
+        not_json,
+        another_version,
+        another_digest,
+        another_split,
+        changed_task,
+        duplicate,
+        stolen_actions,
+        another_name,
+        too_high,
+        no_log,
+        another_log,
+        flattered_row,
     ],
 )
-def test_results_that_do_not_compare_are_refused(
-    metadata: dict[str, Any], reason: str, folder: Path, tmp_path: Path
-) -> None:
-    add(folder, "other", "align-easy", **metadata)
-    with pytest.raises(ResultError, match=reason):
-        leaderboard.build(folder, tmp_path / "out")
+def test_one_bad_result_stops_the_build_and_leaves_the_old_board(spoil: Any, folder: Path) -> None:
+    before = content_of(folder / "out")
+    reason = spoil(folder / "results")
+    with pytest.raises(ResultError, match=reason) as caught:
+        build(folder)
+    assert "\n" not in str(caught.value)
+    assert content_of(folder / "out") == before
 
 
-def test_two_checkpoints_from_folders_of_one_name_are_no_duplicates(
-    folder: Path, tmp_path: Path
-) -> None:
-    add(folder, "first", "align-easy", spec="policy", policy_hash="a")
-    add(folder, "second", "align-easy", spec="policy", policy_hash="b")
-    leaderboard.build(folder, tmp_path / "out")
+def test_a_broken_ledger_says_so(folder: Path) -> None:
+    (folder / "out" / "verified.json").write_text('{"expert/align-easy": {"n_played": -1}}')
+    with pytest.raises(ResultError, match="delete it"):
+        build(folder)
 
 
-def test_a_result_in_the_wrong_place_is_refused(folder: Path, tmp_path: Path) -> None:
-    path = folder / "zero" / "align-easy.json"
-    path.rename(path.with_name("align-hard.json"))
-    with pytest.raises(ResultError, match="named after one task"):
-        leaderboard.build(folder, tmp_path)
-    path.with_name("align-hard.json").rename(folder / "align-easy.json")
-    with pytest.raises(ResultError, match="results lie as"):
-        leaderboard.build(folder, tmp_path)
+def test_two_checkpoints_from_folders_of_one_name_are_no_duplicates(folder: Path) -> None:
+    shutil.copytree(folder / "results" / "zero", folder / "results" / "other")
+    path = folder / "results" / "other" / "align-fixed.json"
+    alter(path, policy_hash="b", actions_sha256=64 * "1")
+    assert len(leaderboard.collect(folder / "results")) == 4
 
 
-def test_a_board_cannot_be_written_below_a_file(folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
+def test_a_board_cannot_be_written_below_a_file(folder: Path) -> None:
+    (folder / "file").write_text("")
     with pytest.raises(OutputError):
-        leaderboard.build(folder, tmp_path / "file")
+        leaderboard.build(folder / "results", folder / "file")
 
 
-def test_it_runs_as_a_script(folder: Path, tmp_path: Path) -> None:
+def test_it_runs_as_a_script(folder: Path) -> None:
+    before = content_of(folder)
     script = [sys.executable, "eval/leaderboard.py"]
-    done = subprocess.run(
-        [*script, "--results", folder, "--out", tmp_path / "out"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    words = ["--results", folder / "results", "--out", folder / "out", "--replay", "1"]
+    done = subprocess.run([*script, *words], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.splitlines() == [
-        str(tmp_path / "out" / "LEADERBOARD.md"),
-        str(tmp_path / "out" / "leaderboard.html"),
+        str(folder / "out" / "LEADERBOARD.md"),
+        str(folder / "out" / "leaderboard.html"),
     ]
-    failed = subprocess.run(
-        [*script, "--results", tmp_path / "none"], cwd=ROOT, capture_output=True, text=True
-    )
-    assert failed.returncode == 2
-    assert len(failed.stderr.splitlines()) == 1
+    assert content_of(folder) == before
+
+
+def test_the_script_says_in_one_line_what_is_wrong(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert leaderboard.main(["--results", str(tmp_path / "none")]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+@pytest.mark.skipif(not (COMMITTED / "LEADERBOARD.md").exists(), reason="no board is committed yet")
+def test_the_committed_board_is_what_the_committed_results_give(tmp_path: Path) -> None:
+    names = ("LEADERBOARD.md", "leaderboard.html", "verified.json", "clips")
+    for name in names:
+        source = COMMITTED / name
+        (shutil.copytree if source.is_dir() else shutil.copy)(source, tmp_path / name)
+    before = content_of(tmp_path)
+    said: list[str] = []
+    leaderboard.build(COMMITTED / "results", tmp_path, say=said.append)
+    # Nothing was missing either: the clips and the ledger are committed with the board.
+    assert said == []
+    assert content_of(tmp_path) == before

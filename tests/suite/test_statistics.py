@@ -5,9 +5,11 @@ import pytest
 import scipy.stats
 
 from hvs_suite.statistics import (
+    holm,
     interquartile_mean,
     interquartile_mean_interval,
     mcnemar,
+    mean_rate_interval,
     paired_difference,
     percentile,
     share_solved_by,
@@ -161,3 +163,35 @@ def test_the_sharpest_tolerance_is_met_by_enough_and_nothing_sharper_is() -> Non
 
 def test_success_against_steps_counts_failures_as_never() -> None:
     np.testing.assert_allclose(share_solved_by([2, None, 4, 2], 5), [0, 50, 50, 75, 75])
+
+
+def test_the_interval_of_one_rate_is_wilsons() -> None:
+    assert mean_rate_interval([(7, 20)]) == pytest.approx(wilson_interval(7, 20))
+    assert mean_rate_interval([(20, 20)])[1] == 100.0
+
+
+def test_the_interval_of_a_mean_rate_covers_the_truth_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(5)
+    rates = np.array([0.95, 0.5, 0.99, 0.1])
+    counts = rng.binomial(100, rates, size=(2000, 4))
+    intervals = [mean_rate_interval([(int(k), 100) for k in row]) for row in counts]
+    covered = [low <= 100 * rates.mean() <= high for low, high in intervals]
+    # A standard error of the share is half a point.
+    assert np.mean(covered) == pytest.approx(0.95, abs=0.015)
+
+
+def test_the_interval_of_a_mean_rate_needs_a_rate() -> None:
+    with pytest.raises(ValueError, match="one or more"):
+        mean_rate_interval([])
+
+
+def test_holm_agrees_with_the_worked_example() -> None:
+    # Times 4, 3, 2, 1 in order of size; the third may not fall below the second.
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([0.6, 0.7]) == [1.0, 1.0]
+    assert holm([]) == []
+
+
+def test_holm_refuses_what_is_no_probability() -> None:
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        holm([0.5, 1.5])
