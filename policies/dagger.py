@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 FIRST_SHARE = 0.35
 LAST_SHARE = 0.80
-"""The rounds are spread over this part of the training: before, the policy errs anyhow; after, there
-would be no time to learn from them."""
+"""The rounds are spread over this part of the training: before, the policy errs anyhow; after, no
+time would be left to learn from them."""
 COLUMNS = "columns.npz"
 SUMMARY = "round.json"
 
