@@ -31,35 +31,74 @@ class Bench:
     whatever else the machine does slows both alike.
 
     Attributes:
-        task: A named task, such as align-thesis.
+        task: A named task, such as align-easy; align-thesis with --expert or --recording.
         seconds: How long to measure each figure (s).
+        expert: Measure the expert instead: its steps against the least that the limits of joint
+            speed and acceleration allow, and the time of a decision.
+        recording: Measure recording instead: its rate against bare simulation.
+        episodes: Episodes that the expert plays or that are recorded.
         json: Print the figures as JSON.
     """
 
-    task: str
+    task: str | None = None
     seconds: float = 6.0
+    expert: bool = False
+    recording: bool = False
+    episodes: int = 200
     json: bool = False
 
     def run(self) -> None:
         """Measure and print."""
-        import hvs_suite
-
         if not self.seconds > 0:
             raise OptionError(f"--seconds must be above 0, not {self.seconds:g}")
-        with hvs_suite.load(self.task) as env:
-            figures = against_bare_loop(env, self.seconds)
-        with hvs_suite.load(self.task, observations="state") as env:
-            steps, elapsed_s, _ = play(env, self.seconds / 2)
-            figures["steps_per_s_no_cameras"] = steps / elapsed_s
-        figures |= with_workers(self.task, self.seconds)
+        demonstrations = self.expert or self.recording
+        if self.task is None and not demonstrations:
+            raise OptionError("say what to measure: --task, such as --task align-easy")
+        task = self.task or "align-thesis"
+        figures: dict[str, float] = {}
+        labels: dict[str, str] = {}
+        if demonstrations:
+            self._check_episodes(task)
+        if self.expert:
+            from hvs_suite.cli import bench_expert
+
+            figures |= bench_expert.expert_figures(task, self.episodes)
+            labels |= bench_expert.LABELS
+        if self.recording:
+            from hvs_suite.cli import bench_recording
+
+            figures |= bench_recording.recording_figures(task, self.episodes, self.seconds)
+            labels |= bench_recording.LABELS
+        if not demonstrations:
+            figures, labels = self._simulation(task), LABELS
         if self.json:
             console.print_json(
-                {"task": self.task} | {name: round(value, 3) for name, value in figures.items()}
+                {"task": task} | {name: round(value, 3) for name, value in figures.items()}
             )
             return
         console.print_table(
-            (self.task, "measured"), [(LABELS[name], f"{figures[name]:.2f}") for name in LABELS]
+            (task, "measured"),
+            [(label, f"{figures[name]:.2f}") for name, label in labels.items()],
         )
+
+    def _check_episodes(self, task: str) -> None:
+        """Refuse counts that say nothing or go beyond the test split."""
+        from hvs_suite.registry import find
+
+        find(task)
+        if not 2 <= self.episodes <= 1000:
+            raise OptionError(f"--episodes is {self.episodes}; use 2 to 1000")
+
+    def _simulation(self, task: str) -> dict[str, float]:
+        """How fast the task steps."""
+        import hvs_suite
+
+        with hvs_suite.load(task) as env:
+            figures = against_bare_loop(env, self.seconds)
+        with hvs_suite.load(task, observations="state") as env:
+            steps, elapsed_s, _ = play(env, self.seconds / 2)
+            figures["steps_per_s_no_cameras"] = steps / elapsed_s
+        return figures | with_workers(task, self.seconds)
 
 
 LABELS = {
@@ -296,6 +335,17 @@ def with_workers(task: str, seconds: float) -> dict[str, float]:
         "two_worker_steps_per_s": statistics.mean(two),
         "two_worker_speedup": statistics.mean(two) / statistics.mean(one),
     }
+
+
+def two_worker_rate(task: str, seconds: float) -> float:
+    """Steps per second of two worker processes together.
+
+    Args:
+        task: A named task.
+        seconds: How long to measure (s).
+    """
+    with _worker(task) as first, _worker(task) as second:
+        return _rate([first, second], seconds)
 
 
 @contextlib.contextmanager

@@ -1,0 +1,55 @@
+"""What ``hvs bench --recording`` measures: recording against bare simulation, in the same run."""
+
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from hvs_suite.cli import console
+from hvs_suite.cli.bench import two_worker_rate
+
+WORKERS = 2
+
+LABELS = {
+    "recorded_episodes": "episodes recorded with two workers, both cameras, lossless",
+    "recording_frames_per_s": "frames recorded a second, expert and resets included",
+    "simulation_steps_per_s": "steps/s of two worker processes that only simulate and draw",
+    "recording_ratio": "ratio of the two",
+}
+
+
+def recording_figures(task: str, episodes: int, seconds: float) -> dict[str, float]:
+    """Records a dataset that is thrown away, between two measurements of bare simulation.
+
+    Args:
+        task: A named task.
+        episodes: Episodes to record.
+        seconds: How long to simulate, before and after together (s).
+
+    Returns:
+        Figures by the names of ``LABELS``. The time until the first episode is written, in which
+        workers start and LeRobot loads, does not count.
+    """
+    from hvs_suite.datasets.recorder import Progress, record
+
+    before = two_worker_rate(task, seconds / 2)
+    told: list[tuple[float, int]] = []
+    with tempfile.TemporaryDirectory(prefix="hvs-bench-") as folder, console.meter() as update:
+
+        def progress(state: Progress) -> None:
+            told.append((time.perf_counter(), state.frames))
+            update("recording", state.episodes / state.total, f"{state.episodes_per_s:.1f}/s")
+
+        record(task, episodes, "train", Path(folder) / "bench", workers=WORKERS, progress=progress)
+        ended = time.perf_counter()
+    after = two_worker_rate(task, seconds / 2)
+    (started, first), (_, last) = told[0], told[-1]
+    rate = (last - first) / (ended - started)
+    simulated = float(np.mean([before, after]))
+    return {
+        "recorded_episodes": episodes,
+        "recording_frames_per_s": rate,
+        "simulation_steps_per_s": simulated,
+        "recording_ratio": rate / simulated,
+    }
