@@ -35,6 +35,9 @@ from hvs_suite.tasks.lock import digest
 from hvs_suite.tasks.variants import AlignVariant, with_options
 
 LEROBOT_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+# Their values are checked one by one; their statistics mean nothing, and LeRobot's own merge leaves
+# them as they were.
+_NUMBERING = ("episode_index", "index", "task_index")
 _TIME_TOLERANCE_S = 1e-4
 _VIDEO_SLACK = 0.03
 _LISTED_DAMAGE = 3
@@ -344,7 +347,7 @@ class CheckEpisode:
         """Compares the episode's listed statistics, and keeps its moments for the dataset's."""
         listed = reader.listed_statistics(self.root, place)
         for name, values in columns.items():
-            if name in listed:
+            if name in listed and name not in _NUMBERING and len(values):
                 findings.moments[name] = Moments.of(values.reshape(len(values), -1))
         for key, pictures in decoded.items():
             shapes = {picture.shape for picture in pictures.values()}

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from hvs_suite.datasets import reader
 from hvs_suite.datasets.card import TAGS
 from hvs_suite.datasets.metadata import METADATA_FILE, read_metadata
 from hvs_suite.errors import DatasetError, OptionError, ServerError
@@ -119,7 +120,10 @@ def convert_to_video(root: Path, out: Path, encoding: Encoding) -> None:
             rgb_encoder=RGBEncoderConfig(vcodec=encoding.codec, crf=encoding.crf),
             num_workers=1,
         )
-    shutil.copy(root / METADATA_FILE, out / METADATA_FILE)
+    # LeRobot drops the pictures' statistics on the way, without which nothing can be normalised;
+    # those of the lossless frames are right to a few thousandths.
+    for name in (METADATA_FILE, reader.STATS):
+        shutil.copy(root / name, out / name)
 
 
 def _open(root: Path, repository: str) -> Any:
