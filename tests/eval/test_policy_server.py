@@ -4,7 +4,6 @@ import contextlib
 import itertools
 import json
 import pickle
-import signal
 import subprocess
 import sys
 import threading
@@ -311,7 +310,7 @@ def test_the_commands_serve_and_evaluate(
             line = f"evaluate --server {url} --policy zero --task {TASK} --episodes 2 --out {out}"
             assert main.run(line.split()) == 0
         finally:
-            server.send_signal(signal.SIGINT)
+            server.terminate()
         assert server.wait(10.0) == 0
     assert result_file.load(out).episodes == protocol.evaluate("zero", TASK, episodes=2).episodes
     assert json.loads(out.read_text())["metadata"]["policy_kind"] == "server"
