@@ -182,7 +182,10 @@ class Expert:
         motion = self._first_clear(q, velocity, candidates, required)
         if motion is None:
             motion = self._escape(q, velocity, position, normal, required)
-        # The arm trails its set point, so the set point leads.
+        return self._point_ahead(motion)
+
+    def _point_ahead(self, motion: ruckig.Trajectory) -> FloatArray:
+        """Where a motion is at the end of the control step (7,); the arm trails its set point."""
         ahead = min(self._period_s + LEAD_S, motion.duration)
         return np.asarray(motion.at_time(ahead)[0])
 

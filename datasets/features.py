@@ -5,7 +5,7 @@ feature                                   dtype, shape    meaning
 ========================================  ==============  ========================================
 ``observation.images.eih``, ``.eth``      image (H,W,3)   as the policy saw it
 ``observation.state``                     float32 (14,)   measured positions (rad), then velocities
-``action``                                float32 (7,)    the expert's action for this frame
+``action``                                float32 (7,)    what the demonstrator would do here
 ``next.reward``                           float32 (1,)    reward of the control step that followed
 ``next.done``, ``next.success``           bool (1,)       whether that step ended, or reached it
 ``privileged.action_executed``            float32 (7,)    what was done; differs where noise was on

@@ -109,7 +109,7 @@ def record(
     )
     # PyArrow and the simulator load only once the arguments have passed.
     from hvs_suite.datasets.demonstration import Demonstrate, MakeEnvironment
-    from hvs_suite.datasets.expert import make_expert
+    from hvs_suite.datasets.looking import make_demonstrator
     from hvs_suite.datasets.writer import DatasetWriter, prepare_root, published_outcomes
 
     if resume:
@@ -122,7 +122,7 @@ def record(
     writer = DatasetWriter(root, features, fps, variant.instruction, block)
     played = play(
         MakeEnvironment(task, split, dict(options or {})),
-        make_expert,
+        make_demonstrator,
         range(len(outcomes), episodes),
         Demonstrate(noise),
         workers=workers,

@@ -224,12 +224,21 @@ def _network(folder: Path, config: Mapping[str, Any]) -> tuple[Decide, Callable[
         raise PolicyError(f"{folder} cannot be loaded as an hvs policy: {reason}") from error
     network.eval()
 
+    memory: Tensor | None = None
+
     def decide(batch: dict[str, Tensor]) -> Tensor:
+        nonlocal memory
         images = {name: batch[IMAGE_PREFIX + name][None] for name in shape.cameras}
         state = batch[STATE][None] if shape.state_dim else None
-        return network.to_action(network(images, state)[0], state)
+        decision = network(images, state, memory)
+        memory = decision.memory
+        return network.to_action(decision.out, state)
 
-    return decide, lambda: None
+    def forget() -> None:
+        nonlocal memory
+        memory = None
+
+    return decide, forget
 
 
 def _lerobot(folder: Path, instruction: str) -> tuple[Decide, Callable[[], None]]:

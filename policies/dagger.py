@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.datasets.demonstration import MakeEnvironment
-from hvs_suite.datasets.expert import Expert
 from hvs_suite.datasets.features import ACTION, Frame, observed_part
+from hvs_suite.datasets.looking import Demonstrator
 from hvs_suite.datasets.recorder import in_order
 from hvs_suite.errors import OutputError
 from hvs_suite.policies.checkpoint import CheckpointFactory
@@ -77,7 +77,7 @@ def correct(env: "Environment", policy: Policy, scenario: int) -> CorrectedEpiso
     Returns:
         The episode.
     """
-    expert = Expert(env)
+    expert = Demonstrator(env)
     time_step = env.reset(scenario=scenario)
     policy.reset()
     frames: list[Frame] = []

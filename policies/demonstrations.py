@@ -19,8 +19,8 @@ from torch import Tensor
 from hvs_suite.datasets.metadata import read_metadata
 from hvs_suite.errors import DatasetError
 from hvs_suite.policies.frame_cache import Frames, OnFrames, cached_frames, data_files
-from hvs_suite.policies.hvs.geometry import Calibration, calibrate
-from hvs_suite.policies.hvs.network import IMAGE_PREFIX, N_JOINTS, STATE
+from hvs_suite.policies.hvs.geometry import Calibration, calibrate, flange_motion
+from hvs_suite.policies.hvs.network import IMAGE_PREFIX, MEMORY, MEMORY_SIZE, N_JOINTS, STATE
 
 ACTION = "action"
 EPISODE = "episode_index"
@@ -31,6 +31,11 @@ TARGET_PREFIX = "privileged.target_"
 HELD_OUT_SHARE = 0.05
 # Philox words that keep this stream apart from the training order.
 HELD_OUT_STREAM = 1
+MEMORY_STREAM = 3
+# How well a trained eye places the target: from afar, and in hand by distance.
+AFAR_SIGMA_M = 0.003
+HAND_SIGMA = 0.006
+HAND_SIGMA_M = 0.0002
 
 Column = npt.NDArray[Any]
 
@@ -169,7 +174,8 @@ class Demonstrations:
             images[key] = cached_frames(
                 manifest.root, key, shape, manifest.n_frames, cache, on_frames
             )
-        self._recordings = [Recording(columns, images)]
+        self._seed = seed
+        self._recordings = [self._with_memory(Recording(columns, images), 0)]
         self._starts = np.array([0])
         episodes = columns[EPISODE]
         names = np.unique(episodes)
@@ -188,9 +194,20 @@ class Demonstrations:
         last = self._recordings[-1]
         start = self._starts[-1] + len(last.columns[EPISODE])
         more = np.arange(start, start + len(recording.columns[EPISODE]))
-        self._recordings.append(recording)
+        self._recordings.append(self._with_memory(recording, len(self._recordings)))
         self._starts = np.append(self._starts, start)
         self.training = np.concatenate([self.training, more])
+
+    def _with_memory(self, recording: Recording, number: int) -> Recording:
+        """Add what a policy would remember at each frame, where the columns tell."""
+        needed = {STATE, GOAL_POSITION, GOAL_NORMAL}
+        if not needed <= set(recording.columns):
+            return recording
+        key = np.random.Philox(key=[self._seed, MEMORY_STREAM], counter=number)
+        memory = remembered_targets(
+            recording.columns, _standoff(self.manifest), np.random.Generator(key)
+        )
+        return Recording({**recording.columns, MEMORY: memory}, recording.images)
 
     def batch(self, indices: npt.NDArray[np.int64]) -> dict[str, Tensor]:
         """Frames as LeRobot's loader would give them.
@@ -199,7 +216,8 @@ class Demonstrations:
             indices: Of the frames, (B,).
 
         Returns:
-            Images (B, C, H, W) float32 in [0, 1], and the columns of `_read_columns`, float32.
+            Images (B, C, H, W) float32 in [0, 1], and float32 the columns of `_read_columns` and
+            ``memory`` (B, 4).
         """
         # Neighbours on disk together: the same rows, fewer page faults.
         indices = np.sort(indices)
@@ -218,6 +236,46 @@ class Demonstrations:
             # (B, H, W, C) stays the layout in memory, which is what the convolutions want.
             batch[key] = images.to(torch.float32).div_(255.0).permute(0, 3, 1, 2)
         return batch
+
+
+def remembered_targets(
+    columns: Mapping[str, Column], standoff_m: float, random: np.random.Generator
+) -> npt.NDArray[np.float32]:
+    """What a policy remembers at each frame: the target where it last saw it, a little off.
+
+    Args:
+        columns: State, goal, targets in the images and ``episode_index``, (n, k) each.
+        standoff_m: Distance between flange face and target at the goal (m).
+        random: Draws how far off.
+
+    Returns:
+        Place (m, base frame), and 1 if a camera saw the target earlier in the episode, else 0 and
+        the place 0, (n, 4).
+    """
+    target = columns[GOAL_POSITION] - standoff_m * columns[GOAL_NORMAL]
+    n = len(target)
+    q = torch.from_numpy(columns[STATE][:, :N_JOINTS])
+    distance = np.linalg.norm(target - flange_motion(q).position.numpy(), axis=1)
+    in_hand, afar = (_in_view(columns.get(TARGET_PREFIX + name), n) for name in ("eih", "eth"))
+    sigma = np.where(in_hand, HAND_SIGMA_M + HAND_SIGMA * distance, AFAR_SIGMA_M)
+    off = random.normal(size=(n, 3)) * sigma[:, None]
+    off[:, 2] = 0.0  # on the surface, which is known
+    episodes, frames = columns[EPISODE], np.arange(n)
+    first = np.maximum.accumulate(np.where(np.diff(episodes, prepend=-1) != 0, frames, 0))
+    last_seen = np.maximum.accumulate(np.where(in_hand | afar, frames, -1))
+    before = np.concatenate([[-1], last_seen[:-1]])
+    memory = np.zeros((n, MEMORY_SIZE), np.float32)
+    known = before >= first
+    memory[known, :3] = (target + off)[before[known]]
+    memory[known, 3] = 1.0
+    return memory
+
+
+def _in_view(target: Column | None, n: int) -> npt.NDArray[np.bool_]:
+    """Which frames show the target, (n,)."""
+    if target is None:
+        return np.zeros(n, np.bool_)
+    return np.asarray((target[:, 3] > 0.5) & (np.abs(target[:, :2]).max(axis=1) <= 1.0))
 
 
 def calibration_of(root: Path) -> Calibration:

@@ -13,6 +13,7 @@ from torch import Tensor
 from hvs_suite.policies.hvs.configuration_hvs import HvsConfig
 from hvs_suite.policies.hvs.network import (
     IMAGE_PREFIX,
+    MEMORY,
     HvsNetwork,
     action_loss,
     sighting_loss,
@@ -45,6 +46,7 @@ class HvsPolicy(PreTrainedPolicy):
         self.config: HvsConfig = config
         self.network = HvsNetwork(config.shape())
         self._warned = False
+        self._memory: Tensor | None = None
         if dataset_meta is not None and not config.pretrained_path:
             self._calibrate_from(Path(dataset_meta.root))
 
@@ -62,7 +64,8 @@ class HvsPolicy(PreTrainedPolicy):
         return self.parameters()
 
     def reset(self) -> None:
-        """Nothing to forget: the policy has no memory."""
+        """Forget where the target was seen: a new episode begins."""
+        self._memory = None
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Loss of a batch.
@@ -70,13 +73,15 @@ class HvsPolicy(PreTrainedPolicy):
         Args:
             batch: The inputs, ``action`` (B, 7), and where the dataset has them
                 ``privileged.target_<camera>`` (B, 4), ``privileged.goal_position`` and
-                ``privileged.goal_normal`` (B, 3).
+                ``privileged.goal_normal`` (B, 3); ``memory`` (B, 4) where the target was seen
+                earlier in the episode, empty if it is missing.
 
         Returns:
             The loss, and its parts as numbers.
         """
         images, state = self._inputs(batch)
-        out, sightings, target = self.network(images, state)
+        decision = self.network(images, state, batch.get(MEMORY))
+        out, sightings, target = decision.out, decision.sightings, decision.target
         label = self.network.encode_label(batch[ACTION], state)
         loss = action_loss(out, label)
         parts = {"action_loss": loss.detach()}
@@ -103,11 +108,14 @@ class HvsPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Chunk of one action, (B, 1, 7) in [-1, 1]."""
+        """Chunk of one action, (B, 1, 7) in [-1, 1]; one call an observation, for its memory."""
         self.eval()
         images, state = self._inputs(batch)
-        out = self.network(images, state)[0]
-        return self.network.to_action(out, state)[:, None]
+        if self._memory is not None and len(self._memory) != len(next(iter(images.values()))):
+            self._memory = None  # Other environments than before.
+        decision = self.network(images, state, self._memory)
+        self._memory = decision.memory
+        return self.network.to_action(decision.out, state)[:, None]
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:

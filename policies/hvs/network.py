@@ -3,7 +3,9 @@
 Each camera has its own small convolutional encoder that ends in one *keypoint*: the softmax of one
 channel is a distribution over the image, its mean the target's centre. The keypoints are placed in
 space by fixed geometry, and a small perceptron turns joints and target into a joint step on a
-logarithmic scale, so that errors of a micrometre and of a metre both teach it something.
+logarithmic scale, so that errors of a micrometre and of a metre both teach it something. Where the
+arm hides the target from both cameras, the place where it was last seen stands in: a memory of
+three numbers, which the caller keeps.
 
 No LeRobot in here: a rollout worker starts in the time torch takes to import.
 """
@@ -23,6 +25,9 @@ from hvs_suite.policies.hvs.geometry import Calibration
 
 IMAGE_PREFIX = "observation.images."
 STATE = "observation.state"
+MEMORY = "memory"
+"""Key of a batch: where the target was last seen before, see `HvsNetwork.forward`."""
+MEMORY_SIZE = 4
 N_JOINTS = 7
 FEATURE_SIZE = 28
 """Cells along the side of a feature map, about."""
@@ -33,6 +38,9 @@ DELTA_SCALE_RAD = 0.005
 """Joint steps are regressed as asinh(step / this): linear below, logarithmic above."""
 OFFSET_SCALE_M = 0.005
 POSITIONS_AND_VELOCITIES = 2 * N_JOINTS
+SEEN_LOGIT = 2.0
+"""How sure an eye must be (as a logit) that it sees the target before its place is remembered."""
+ESTIMATE_FEATURES = 7
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,6 +103,23 @@ class Sighting:
         """What the head reads of it, (B, 5)."""
         logits = torch.cat([self.visible_logit, self.trust_logit], dim=1)
         return torch.cat([self.uv, self.log_diameter, torch.tanh(logits / 4.0)], dim=1)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Decision:
+    """What the network makes of one observation.
+
+    Attributes:
+        out: The head's output, (B, 7), see `HvsNetwork.to_action`.
+        sightings: Camera name to what it saw.
+        target: Where the target is taken to be, (B, 3) m in the base frame; None without joints.
+        memory: What to remember for the next observation, (B, 4); None without joints.
+    """
+
+    out: Tensor
+    sightings: dict[str, Sighting]
+    target: Tensor | None
+    memory: Tensor | None
 
 
 def strides(side: int) -> tuple[int, ...]:
@@ -227,7 +252,9 @@ class HvsNetwork(nn.Module):
         n_cameras = len(shape.cameras)
         width = SIGHTING_FEATURES * n_cameras
         if shape.state_dim:
-            width += 3 * N_JOINTS + 12 + 7 * (n_cameras + (n_cameras > 1)) + N_JOINTS
+            # Each camera's estimate, the better of two, the remembered one.
+            n_estimates = n_cameras + (n_cameras > 1) + 1
+            width += 3 * N_JOINTS + 12 + ESTIMATE_FEATURES * n_estimates + N_JOINTS
             if shape.state_dim == POSITIONS_AND_VELOCITIES:
                 width += N_JOINTS
         hidden = shape.hidden
@@ -265,33 +292,39 @@ class HvsNetwork(nn.Module):
         return {name: eye(images[name]) for name, eye in self.eyes.items()}
 
     def forward(
-        self, images: Mapping[str, Tensor], state: Tensor | None
-    ) -> tuple[Tensor, dict[str, Sighting], Tensor | None]:
+        self,
+        images: Mapping[str, Tensor],
+        state: Tensor | None,
+        memory: Tensor | None = None,
+    ) -> Decision:
         """Decide.
 
         Args:
             images: Camera name to (B, C, H, W) in [0, 1].
             state: Measured joint positions (rad), then velocities (rad/s), (B, 14) or (B, 7);
                 None if the policy has no joint inputs.
+            memory: Where the target was last seen (m, base frame), and 1 if it was ever seen in
+                this episode, else 0, (B, 4); None for never.
 
         Returns:
-            The head's output, (B, 7) (see `to_action`), what each camera saw, and the estimated
-            target, (B, 3) m in the base frame (None without joints).
+            The decision.
         """
         # Half a millimetre at the flange is 1e-3 rad: nothing here may be rounded by autocast.
         with torch.autocast(self.joint_range.device.type, enabled=False):
-            return self._decide(images, state)
+            return self._decide(images, state, memory)
 
     def _decide(
-        self, images: Mapping[str, Tensor], state: Tensor | None
-    ) -> tuple[Tensor, dict[str, Sighting], Tensor | None]:
+        self, images: Mapping[str, Tensor], state: Tensor | None, memory: Tensor | None
+    ) -> Decision:
         sightings = self.look(images)
         features = [s.features() for s in sightings.values()]
         if state is None:
-            return self.head(torch.cat(features, dim=1)), sightings, None
+            return Decision(self.head(torch.cat(features, dim=1)), sightings, None, None)
         q = state[:, :N_JOINTS]
+        if memory is None:
+            memory = state.new_zeros(len(state), MEMORY_SIZE)
         motion = geometry.flange_motion(q)
-        target, estimates = self._place(motion, sightings)
+        target, estimates, remembered = self._place(motion, sightings, memory)
         lift = torch.zeros_like(target)
         lift[:, 2] = self.standoff
         step = torch.asinh(
@@ -306,34 +339,46 @@ class HvsNetwork(nn.Module):
             in_flange = (offset[:, None] @ motion.rotation)[:, 0]
             features += [offset, torch.asinh(in_flange / OFFSET_SCALE_M), estimate[:, 3:]]
         out = self.head(torch.cat(features, dim=1)) + self.step_gain * step
-        return out, sightings, target
+        return Decision(out, sightings, target, remembered)
 
     def _place(
-        self, motion: geometry.FlangeMotion, sightings: Mapping[str, Sighting]
-    ) -> tuple[Tensor, list[Tensor]]:
+        self, motion: geometry.FlangeMotion, sightings: Mapping[str, Sighting], memory: Tensor
+    ) -> tuple[Tensor, list[Tensor], Tensor]:
         """Put the target into space.
 
         Returns:
-            The best estimate (B, 3) m, and every estimate with its weight, (B, 4) each.
+            The best estimate (B, 3) m, every estimate with its weight, (B, 4) each, and the next
+            memory (B, 4).
         """
-        estimates = []
+        estimates, logits = [], []
         valid = motion.position.new_ones(len(motion.position), 1)
         for name, sighting in sightings.items():
-            confidence = torch.sigmoid(sighting.visible_logit)
+            logit = sighting.visible_logit
             if name == "eih":
                 point = geometry.seen_from_hand(motion, sighting.uv, self.rays, self.plane_height)
                 valid = point[:, 3:]
-                estimates.append(torch.cat([point[:, :3], valid * confidence], dim=1))
+                logit = torch.where(valid > 0, logit, torch.full_like(logit, -20.0))
             else:
                 point = geometry.seen_from_afar(sighting.uv, self.homography, self.plane_height)
-                estimates.append(torch.cat([point, confidence], dim=1))
-        if len(estimates) == 1:
-            return estimates[0][:, :3], estimates
-        hand, afar = sightings.values()  # the eye in hand comes first
-        logit = hand.trust_logit - afar.trust_logit
-        share = torch.sigmoid(torch.where(valid > 0, logit, torch.full_like(logit, -20.0)))
-        best = share * estimates[0][:, :3] + (1.0 - share) * estimates[1][:, :3]
-        return best, [*estimates, torch.cat([best, share], dim=1)]
+            estimates.append(torch.cat([point[:, :3], torch.sigmoid(logit)], dim=1))
+            logits.append(logit)
+        seen = torch.stack(logits).amax(dim=0)
+        best = estimates[0][:, :3]
+        if len(estimates) > 1:
+            hand, afar = sightings.values()  # the eye in hand comes first
+            logit = hand.trust_logit - afar.trust_logit
+            share = torch.sigmoid(torch.where(valid > 0, logit, torch.full_like(logit, -20.0)))
+            best = share * estimates[0][:, :3] + (1.0 - share) * estimates[1][:, :3]
+            estimates.append(torch.cat([best, share], dim=1))
+        known = memory[:, 3:]
+        # An empty memory stands at the present estimate, so that it says nothing.
+        place = known * memory[:, :3] + (1.0 - known) * best
+        estimates.append(torch.cat([place, known], dim=1))
+        is_seen = seen > SEEN_LOGIT
+        fresh = torch.cat([best, torch.ones_like(known)], dim=1)
+        remembered = torch.where(is_seen, fresh, memory).detach()
+        doubt = 1.0 - torch.sigmoid(seen)
+        return best + doubt * (place - best), estimates, remembered
 
     def to_action(self, out: Tensor, state: Tensor | None) -> Tensor:
         """Decode the head's output.

@@ -93,9 +93,10 @@ def test_every_subset_of_inputs_trains_and_acts(names, state_dim):
     cameras = {name: CAMERAS[name] for name in names}
     net = network(cameras, state_dim)
     images, state = inputs(cameras, state_dim)
-    out, sightings, target = net(images, state)
+    decision = net(images, state)
+    out, sightings = decision.out, decision.sightings
     assert out.shape == (5, 7)
-    assert (target is None) == (state is None)
+    assert (decision.target is None) == (state is None)
     truth = torch.tensor([[0.1, 0.2, 0.3, 1.0]]).expand(5, 4)
     loss = action_loss(out, torch.ones(5, 7))
     for sighting in sightings.values():
@@ -112,7 +113,7 @@ def test_every_resolution_and_channel_count_has_about_28_cells(channels, side):
     assert abs(side / np.prod(strides(side)) - FEATURE_SIZE) <= 2
     cameras = {"eth": (channels, side)}
     images, state = inputs(cameras, n=1)
-    assert network(cameras)(images, state)[0].shape == (1, 7)
+    assert network(cameras)(images, state).out.shape == (1, 7)
 
 
 def test_the_label_is_what_the_action_decodes_to():
@@ -138,9 +139,9 @@ def test_a_few_images_are_learned_by_heart():
     optimizer = torch.optim.AdamW(net.parameters(), lr=3e-3)
     losses = []
     for _ in range(250):
-        out, sightings, _ = net(images, state)
-        loss = action_loss(out, label)
-        for name, sighting in sightings.items():
+        decision = net(images, state)
+        loss = action_loss(decision.out, label)
+        for name, sighting in decision.sightings.items():
             loss = loss + sighting_loss(sighting, truth[name])
         optimizer.zero_grad()
         loss.backward()

@@ -262,7 +262,9 @@ def test_ctrl_c_ends_workers_without_a_word_from_them() -> None:
         f"""
         import sys
         sys.path.insert(0, {str(Path(__file__).parent)!r})
-        import multiprocessing
+        import multiprocessing, signal
+        # Shells start background jobs, this test's perhaps, with the signal masked.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         from test_rollout import Counter, Echo
         from hvs_suite.rollout import rollout
         def told(episode):

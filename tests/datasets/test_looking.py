@@ -1,0 +1,56 @@
+"""The demonstrator: it looks where the expert would already know, and is the expert otherwise."""
+
+import numpy as np
+import pytest
+
+import hvs_suite
+from hvs_suite.datasets.expert import Expert
+from hvs_suite.datasets.looking import Demonstrator
+
+SCENES = 100
+
+
+def is_hidden(env) -> bool:
+    truth = env.privileged()
+    return all(truth[name][3] < 0.5 for name in ("target_eih", "target_eth"))
+
+
+@pytest.mark.parametrize("task", ["align-thesis", "align-hard"])
+def test_hidden_targets_are_looked_for_and_reached_in_time(task):
+    n_hidden = 0
+    with hvs_suite.load(task, split="train", observations="state") as env:
+        demonstrator = Demonstrator(env)
+        for scenario in range(SCENES):
+            time_step = env.reset(scenario=scenario)
+            if not is_hidden(env):
+                continue
+            n_hidden += 1
+            demonstrator.reset()
+            while not time_step.last():
+                time_step = env.step(demonstrator.select_action({}))
+            assert env.info["is_success"], scenario
+    assert n_hidden >= 2
+
+
+def test_what_to_do_does_not_depend_on_a_target_that_no_camera_saw():
+    answers, experts = [], []
+    with hvs_suite.load("align-thesis", split="train", observations="state") as env:
+        for scenario in range(SCENES):
+            env.reset(scenario=scenario)
+            if is_hidden(env):
+                answers.append(Demonstrator(env).label())
+                experts.append(Expert(env).label())
+    assert len(answers) >= 2
+    for answer in answers[1:]:
+        np.testing.assert_array_equal(answer, answers[0])
+    assert np.abs(np.diff(experts, axis=0)).max() > 1e-3  # while the expert knows
+
+
+def test_once_seen_the_target_is_gone_for_as_the_expert_goes():
+    with hvs_suite.load("align-thesis", split="train", observations="state") as env:
+        scenarios = iter(range(SCENES))
+        env.reset(scenario=next(scenarios))
+        while is_hidden(env):
+            env.reset(scenario=next(scenarios))
+        demonstrator = Demonstrator(env)
+        np.testing.assert_array_equal(demonstrator.label(), Expert(env).label())
