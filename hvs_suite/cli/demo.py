@@ -11,7 +11,6 @@ from pathlib import Path
 from hvs_suite.cli import console
 from hvs_suite.errors import OptionError, OutputError
 
-TASK = "align-easy"
 # Without disturbed episodes and starts near the goal, a policy never learns to correct itself.
 NOISE_RAD = 0.02
 PARTS = ("dataset", "policy", "results", "board", "episode.gif")
@@ -25,15 +24,19 @@ class Demo:
 
     Attributes:
         out: Folder for everything the demo makes.
+        task: Named task.
         episodes: Demonstrations to record.
         minutes: Training time (min).
+        dagger_rounds: How often the policy plays in between and the expert corrects it.
         evaluations: Test scenarios to score the policy on.
         overwrite: Replace what an earlier demo left in the folder.
     """
 
     out: Path = Path("runs/demo")
+    task: str = "align-easy"
     episodes: int = 250
     minutes: float = 4.0
+    dagger_rounds: int = 0
     evaluations: int = 50
     overwrite: bool = False
 
@@ -51,12 +54,12 @@ class Demo:
         dataset, policy = self.out / "dataset", self.out / "policy"
         results, board = self.out / "results", self.out / "board"
         film = self.out / "episode.gif"
-        result = results / "demo" / f"{TASK}.json"
+        result = results / "demo" / f"{self.task}.json"
         times_s: dict[str, float] = {}
 
-        with _stage(f"record {self.episodes} demonstrations of {TASK}", times_s):
+        with _stage(f"record {self.episodes} demonstrations of {self.task}", times_s):
             Record(
-                task=TASK,
+                task=self.task,
                 episodes=self.episodes,
                 out=dataset,
                 start="mixed",
@@ -64,11 +67,13 @@ class Demo:
                 workers=2,
             ).run()
         with _stage(f"train a policy on them for {self.minutes:g} min", times_s):
-            Pretrain(data=dataset, out=policy, minutes=self.minutes).run()
+            Pretrain(
+                data=dataset, out=policy, minutes=self.minutes, dagger_rounds=self.dagger_rounds
+            ).run()
         with _stage(f"score it on {self.evaluations} test scenarios", times_s):
             Evaluate(
                 policy=str(policy),
-                task=(TASK,),
+                task=(self.task,),
                 split="test",
                 episodes=self.evaluations,
                 workers=2,
@@ -77,7 +82,7 @@ class Demo:
         with _stage("build the board", times_s):
             Leaderboard(results=results, out=board).run()
         with _stage("film an episode", times_s):
-            film_one(policy, film)
+            film_one(policy, self.task, film)
 
         self._report(result, board, times_s)
 
@@ -111,7 +116,7 @@ class Demo:
             ],
         )
         print(
-            f"{TASK}, the demo's own policy: {summary['n_success']} of {summary['n_episodes']} "
+            f"{self.task}, the demo's own policy: {summary['n_success']} of {summary['n_episodes']} "
             f"solved, {summary['pc_success']:.1f} % (95 % interval {low:.1f} to {high:.1f} %)"
         )
         for what, path in (
@@ -124,11 +129,12 @@ class Demo:
             print(f"{what:<12}{path}")
 
 
-def film_one(policy: Path, film: Path) -> None:
+def film_one(policy: Path, task: str, film: Path) -> None:
     """Film test scenario 0 played by a checkpoint, whatever comes of it.
 
     Args:
         policy: Checkpoint folder.
+        task: Named task.
         film: GIF to write.
     """
     import hvs_suite
@@ -136,8 +142,8 @@ def film_one(policy: Path, film: Path) -> None:
     from hvs_suite.cli.view import describe
     from hvs_suite.policies.catalogue import policy_factory
 
-    with hvs_suite.load(TASK, split="test") as env:
-        player = policy_factory(str(policy), TASK)(env)
+    with hvs_suite.load(task, split="test") as env:
+        player = policy_factory(str(policy), task)(env)
         episode, frames = pictures.film_episode(env, player, 0)
         pictures.write_film(film, frames, 0.5 / env.variant.control_period_s)
     print(describe(episode, "the demo's policy"))
