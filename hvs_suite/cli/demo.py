@@ -117,7 +117,8 @@ class Demo:
         )
         print(
             f"{self.task}, the demo's own policy: {summary['n_success']} of "
-            f"{summary['n_episodes']} solved, {summary['pc_success']:.1f} % (95 % interval {low:.1f} to {high:.1f} %)"
+            f"{summary['n_episodes']} solved, {summary['pc_success']:.1f} % "
+            f"(95 % interval {low:.1f} to {high:.1f} %)"
         )
         for what, path in (
             ("dataset", self.out / "dataset"),
