@@ -80,15 +80,17 @@ def displaced(
     scenario, variant = env.scenario, env.variant
     frame = tool_frame(scenario.normal)
     goal = scenario.target + scenario.normal * (variant.standoff_m + height_m)
-    across = np.cos(0.7) * frame[:, 0] + np.sin(0.7) * frame[:, 1]
     angle = np.deg2rad(tilt_deg)
-    # Lean the tool axis about the other direction of the plane: it stays a unit vector.
-    aside = np.cross(scenario.normal, across)
-    normal = np.cos(angle) * scenario.normal + np.sin(angle) * aside
     swivel = np.linspace(-np.pi, np.pi, 24)
-    family = kinematics().inverse_kinematics(
-        goal + lateral_m * across, normal, np.full(len(swivel), yaw), swivel
-    )
-    if not len(family):
-        raise AssertionError(f"scenario {scenario.index}: the displaced pose is out of reach")
-    return np.asarray(family[0])
+    # At the rim of the working area only some directions stay within reach.
+    for azimuth in 0.7 + np.arange(4) * np.pi / 2.0:
+        across = np.cos(azimuth) * frame[:, 0] + np.sin(azimuth) * frame[:, 1]
+        # Lean the tool axis about the other direction of the plane: it stays a unit vector.
+        aside = np.cross(scenario.normal, across)
+        normal = np.cos(angle) * scenario.normal + np.sin(angle) * aside
+        family = kinematics().inverse_kinematics(
+            goal + lateral_m * across, normal, np.full(len(swivel), yaw), swivel
+        )
+        if len(family):
+            return np.asarray(family[0])
+    raise AssertionError(f"scenario {scenario.index}: the displaced pose is out of reach")
