@@ -82,7 +82,7 @@ class Demo:
         with _stage("build the board", times_s):
             Leaderboard(results=results, out=board).run()
         with _stage("film an episode", times_s):
-            film_one(policy, self.task, film)
+            film_one(policy, self.task, _solved_scenario(result), film)
 
         self._report(result, board, times_s)
 
@@ -130,12 +130,19 @@ class Demo:
             print(f"{what:<12}{path}")
 
 
-def film_one(policy: Path, task: str, film: Path) -> None:
-    """Film test scenario 0 played by a checkpoint, whatever comes of it.
+def _solved_scenario(result: Path) -> int:
+    """The first scenario of a result that was solved, 0 if none was."""
+    rows = json.loads(result.read_text(encoding="utf-8"))["episodes"]
+    return next((int(row["scenario"]) for row in rows if row["success"]), 0)
+
+
+def film_one(policy: Path, task: str, scenario: int, film: Path) -> None:
+    """Film a test scenario played by a checkpoint.
 
     Args:
         policy: Checkpoint folder.
         task: Named task.
+        scenario: Index of the scenario.
         film: GIF to write.
     """
     import hvs_suite
@@ -145,7 +152,7 @@ def film_one(policy: Path, task: str, film: Path) -> None:
 
     with hvs_suite.load(task, split="test") as env:
         player = policy_factory(str(policy), task)(env)
-        episode, frames = pictures.film_episode(env, player, 0)
+        episode, frames = pictures.film_episode(env, player, scenario)
         pictures.write_film(film, frames, 0.5 / env.variant.control_period_s)
     print(describe(episode, "the demo's policy"))
 
