@@ -78,16 +78,50 @@ def stopping_travel_time(
         Time of the slowest joint (m,) in s, and the sum over joints of (distance / speed)^2 (m,)
         in s^2.
     """
-    a, w = robot.JOINT_ACCELERATION_RAD_S2[: len(q)], robot.JOINT_SPEED_RAD_S[: len(q)]
-    way = goals - q
-    v = np.clip(velocity, -w, w)
-    direction = np.where(way - v * np.abs(v) / (2.0 * a) >= 0.0, 1.0, -1.0)
-    x, u = direction * way, direction * v
-    peak = np.sqrt(np.maximum(a * x + 0.5 * u**2, 0.0))
+    return _stopping_travel_time(q, velocity, np.ascontiguousarray(goals.T))
+
+
+def _stopping_travel_time(
+    q: FloatArray, velocity: FloatArray, goals: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """``stopping_travel_time`` for goals (n, m), joint by joint along the first axis."""
+    a = robot.JOINT_ACCELERATION_RAD_S2[: len(q), None]
+    w = robot.JOINT_SPEED_RAD_S[: len(q), None]
+    way = goals - q[:, None]
+    v = np.clip(velocity[:, None], -w, w)
+    onward = way - v * np.abs(v) / (2.0 * a) >= 0.0
+    x, u = np.where(onward, way, -way), np.where(onward, v, -v)
+    peak = np.sqrt(np.maximum(a * x + 0.5 * v**2, 0.0))
     bang_bang = (2.0 * peak - u) / a
-    cruising = (2.0 * w - u) / a + (x - (2.0 * w**2 - u**2) / (2.0 * a)) / w
+    cruising = (2.0 * w - u) / a + (x - (2.0 * w**2 - v**2) / (2.0 * a)) / w
     times = np.where(peak <= w, bang_bang, cruising)
-    return times.max(axis=-1), ((way / w) ** 2).sum(axis=-1)
+    return times.max(axis=0), ((way / w) ** 2).sum(axis=0)
+
+
+def _soonest_first(
+    q: FloatArray, velocity: FloatArray, family: FloatArray
+) -> collections.abc.Iterator[FloatArray]:
+    """Configurations (7,) of a family (m, 7), the one reached soonest first.
+
+    The first is nearly always clear, so it is found without ranking all: no time is below that at
+    full speed, and only configurations that could be soonest by that bound are timed.
+    """
+    # Joint by joint along the first axis: NumPy is slow over rows of seven.
+    joints = np.ascontiguousarray(family[:, :6].T)
+
+    def price(which: npt.NDArray[np.intp]) -> FloatArray:
+        times, effort = _stopping_travel_time(q[:6], velocity[:6], joints[:, which])
+        return times + TIE_BREAK_S * effort
+
+    way = np.abs(joints - q[:6, None])
+    bound = (way / robot.JOINT_SPEED_RAD_S[:6, None]).max(axis=0)
+    [limit] = price(np.argmin(bound, keepdims=True))
+    # A little slack, because both sides are rounded.
+    [within] = np.nonzero(bound <= limit + 1e-9)
+    first = within[np.argmin(price(within))]
+    yield family[first]
+    order = np.argsort(price(np.arange(len(family))), kind="stable")
+    yield from family[order[order != first]]
 
 
 class Expert:
@@ -112,6 +146,8 @@ class Expert:
         self._period_s = env.variant.control_period_s
         self._goal_key: bytes = b""
         self._family: FloatArray = np.empty((0, 7))
+        self._across: FloatArray = np.empty((2, 3))
+        """Two directions along the goal's surface, (2, 3)."""
         self._floor_m = 0.0
         self._ruckig = ruckig.Ruckig(7)
         self._input = ruckig.InputParameter(7)
@@ -147,6 +183,7 @@ class Expert:
         key = position.tobytes() + normal.tobytes()
         if key != self._goal_key:
             self._goal_key = key
+            self._across = np.linalg.svd(normal[None])[2][1:]
             self._family = self._kinematics.goal_configurations_at_tool_angle(
                 position, normal, tool_angle=0.0, n_swivel=N_SWIVEL
             )
@@ -175,10 +212,11 @@ class Expert:
         self, q: FloatArray, velocity: FloatArray, position: FloatArray, normal: FloatArray
     ) -> FloatArray:
         """Where the set point (7,) shall be at the end of the control step."""
-        candidates = self._ranked_goals(q, velocity, position, normal)
-        if len(candidates) == 0:
+        family = self._reachable(q, velocity, position, normal)
+        if len(family) == 0:
             return q  # Out of reach: stand still.
         required = min(CLEARANCE_M, self._kinematics.clearance(q, self._floor_m) - 1e-3)
+        candidates = _soonest_first(q, velocity, family)
         motion = self._first_clear(q, velocity, candidates, required)
         if motion is None:
             motion = self._escape(q, velocity, position, normal, required)
@@ -190,7 +228,11 @@ class Expert:
         return np.asarray(motion.at_time(ahead)[0])
 
     def _first_clear(
-        self, q: FloatArray, velocity: FloatArray, candidates: FloatArray, required: float
+        self,
+        q: FloatArray,
+        velocity: FloatArray,
+        candidates: collections.abc.Iterable[FloatArray],
+        required: float,
     ) -> ruckig.Trajectory | None:
         """The motion to the first candidate that keeps clear; skips what is near a blocked one."""
         blocked: list[FloatArray] = []
@@ -235,27 +277,20 @@ class Expert:
                 best, clearest = least, motion
         return clearest
 
-    def _ranked_goals(
+    def _reachable(
         self, q: FloatArray, velocity: FloatArray, position: FloatArray, normal: FloatArray
     ) -> FloatArray:
-        """Goal configurations (m, 7), the one reached soonest first.
+        """Goal configurations (m, 7), in no order.
 
         A7 alone turns the free yaw, so it is left where it comes to rest.
         """
         a = robot.JOINT_ACCELERATION_RAD_S2[6]
         rest = q[6] + velocity[6] * abs(velocity[6]) / (2.0 * a)
-        tool_angle = np.clip(rest, -robot.JOINT_RANGE_RAD[6], robot.JOINT_RANGE_RAD[6])
-        family = self._family
         nearest = self._nearest_goal(q, velocity, position, normal)
-        if nearest is not None:
-            family = np.concatenate([family, nearest[None]])
-        if len(family) == 0:
-            return family
-        times, effort = stopping_travel_time(q[:6], velocity[:6], family[:, :6])
-        order = np.argsort(times + TIE_BREAK_S * effort, kind="stable")
-        ranked = family[order]
-        ranked[:, 6] = tool_angle
-        return ranked
+        added = [] if nearest is None else [nearest[None]]
+        family = np.concatenate([self._family, *added])
+        family[:, 6] = min(max(rest, -robot.JOINT_RANGE_RAD[6]), robot.JOINT_RANGE_RAD[6])
+        return family
 
     def _nearest_goal(
         self, q: FloatArray, velocity: FloatArray, position: FloatArray, normal: FloatArray
@@ -267,14 +302,13 @@ class Expert:
         """
         a = robot.JOINT_ACCELERATION_RAD_S2
         goal = q + velocity * np.abs(velocity) / (2.0 * a)
-        across = np.linalg.svd(normal[None])[2][1:]
         for iteration in range(_ITERATIONS):
             R, flange = self._kinematics.flange_pose(goal)
             away = position - flange
             if iteration == 0 and np.linalg.norm(away) > PROJECTION_RANGE_M:
                 return None
             # Rotation vector that takes the flange axis onto the inward normal; yaw stays free.
-            turn = np.cross(R[:, 2], -normal)
+            across, turn = self._across, _cross(R[:, 2], -normal)
             error = np.concatenate([away, across @ turn])
             if np.abs(error).max() < 1e-9:
                 break
@@ -324,6 +358,12 @@ class Expert:
             if least < required or t >= motion.duration:
                 return float(least)
             t += max(_PATH_STEP_S, (clearance - CLEARANCE_M) / _MAX_FLANGE_SPEED_M_S)
+
+
+def _cross(one: FloatArray, two: FloatArray) -> FloatArray:
+    """Vector product (3,) of two vectors (3,); NumPy's is slow on so few numbers."""
+    (a, b, c), (x, y, z) = one.tolist(), two.tolist()
+    return np.array([b * z - c * y, c * x - a * z, a * y - b * x])
 
 
 def make_expert(env: Environment) -> Expert:

@@ -73,13 +73,29 @@ def sample(pictures: Sequence[npt.NDArray[np.uint8]]) -> Moments:
     Args:
         pictures: uint8 (H, W, 3) each, all alike in shape.
     """
+    chosen = sampled_pictures(pictures)
+    return Moments.of(chosen.reshape(-1, chosen.shape[-1]), len(chosen)).scaled(1.0 / 255.0)
+
+
+def sampled_pictures(pictures: Sequence[npt.NDArray[np.uint8]]) -> npt.NDArray[np.uint8]:
+    """The pixels of an episode that LeRobot looks at: not all pictures, not all of a large one.
+
+    Args:
+        pictures: uint8 (H, W, C) each, all alike in shape.
+
+    Returns:
+        uint8 (n, h, w, C).
+    """
     n = len(pictures)
     taken = max(min(n, _MAX_SAMPLED), min(int(n**0.75), _MIN_POWER_SAMPLES))
     indices = np.round(np.linspace(0, n - 1, taken)).astype(int)
     side = max(pictures[0].shape[:2])
     step = 1 if side < _DOWNSAMPLE_FROM_PX else int(side / _DOWNSAMPLE_TO_PX)
     chosen = np.stack([pictures[i][::step, ::step] for i in indices])
-    return Moments.of(chosen.reshape(-1, chosen.shape[-1]), taken).scaled(1.0 / 255.0)
+    if taken > 1:
+        return chosen
+    # Of a single picture LeRobot sums plane by plane, which rounds otherwise than pixel by pixel.
+    return np.ascontiguousarray(chosen.transpose(0, 3, 1, 2)).transpose(0, 2, 3, 1)
 
 
 def merge(parts: Sequence[Moments]) -> Moments:

@@ -1,6 +1,6 @@
 """Recording: the expert's demonstrations of a task as one LeRobot dataset.
 
-Workers play scenarios and render; this process alone imports LeRobot and writes. Episode i of the
+Workers play scenarios, render and encode; this process alone writes. Episode i of the
 dataset is scenario i of the split, whatever the number of workers and however often the recording
 was interrupted.
 """
@@ -131,7 +131,7 @@ def record(
         with contextlib.closing(played):
             for demonstration in in_order(played, len(outcomes)):
                 writer.save(demonstration)
-                tracker.saved(len(demonstration.frames), demonstration.success)
+                tracker.saved(demonstration.length, demonstration.success)
         writer.publish()
     except KeyboardInterrupt:
         writer.publish()
@@ -175,7 +175,7 @@ class _Tracker:
         self._total = total
         self._frames = 0
         self._progress = progress
-        # Until the first episode is there, workers start and LeRobot loads: not part of the rate.
+        # Until the first episode is there, workers start: not part of the rate.
         self._since: float | None = None
 
     def saved(self, frames: int, success: bool) -> None:

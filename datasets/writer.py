@@ -1,41 +1,56 @@
 """Writing a LeRobot dataset so that a kill loses the episodes of one block at most.
 
-LeRobot's parquet files have no footer until ``finalize()``, while ``info.json`` already counts
-their episodes: a dataset whose recorder was killed does not load. So each block of episodes is
-written into a hidden folder inside the dataset and moved into place once it is finalised, files
-first and counts last. What stands in place always loads.
+Parquet files have no footer until they are closed: a dataset whose recorder was killed would not
+load. So each block of episodes is written into a hidden folder inside the dataset and moved into
+place once it is whole, files first and counts last. What stands in place always loads.
 """
 
 import contextlib
-import importlib
+import dataclasses
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
 
+from hvs_suite.datasets import lerobot_files as files
 from hvs_suite.datasets.demonstration import Demonstration
+from hvs_suite.datasets.episode_stats import FeatureStats, column_stats, merge_stats
 from hvs_suite.datasets.features import ROBOT_TYPE
 from hvs_suite.errors import DatasetError, OutputError
 
 STAGE = ".recording"
 """Hidden folder inside the dataset that holds the block being written."""
-IMAGE_WRITER_THREADS = 2
-# Named so that LeRobot does not probe torchcodec, which complains at length without FFmpeg.
-_UNUSED_VIDEO_BACKEND = "pyav"
-_EPISODES = Path("meta", "episodes")
-_INFO = Path("meta", "info.json")
+_DATA_PLACE = ("data/chunk_index", "data/file_index")
+_EPISODE_PLACE = ("meta/episodes/chunk_index", "meta/episodes/file_index")
 # Counts come last: until then readers see the dataset as it was before the block.
-_COUNTS = (Path("meta", "tasks.parquet"), Path("meta", "stats.json"), _INFO)
+_COUNTS = (files.TASKS, files.STATS, files.INFO)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Published:
+    """What stands in place.
+
+    Attributes:
+        episodes: Episodes.
+        frames: Frames.
+        data_files: Number of the next data file.
+        episode_files: Number of the next file of ``meta/episodes``.
+        stats: Statistics of it all; empty where there is nothing.
+    """
+
+    episodes: int = 0
+    frames: int = 0
+    data_files: int = 0
+    episode_files: int = 0
+    stats: Mapping[str, FeatureStats] = dataclasses.field(default_factory=dict)
 
 
 class DatasetWriter:
     """Appends demonstrations to the dataset at ``root``, block by block.
-
-    Importing LeRobot's dataset package takes some 20 s, which making the first block pays.
 
     Args:
         root: The dataset; may be missing or empty, or hold published blocks.
@@ -56,11 +71,12 @@ class DatasetWriter:
         self._root = root
         self._stage = root / STAGE
         self._features = dict(features)
+        self._schema = files.data_schema(features)
         self._fps = fps
         self._task = task
         self._block = block
-        self._dataset: Any = None
-        self._in_block = 0
+        self._published: _Published | None = None
+        self._open: _Block | None = None
 
     def save(self, demonstration: Demonstration) -> None:
         """Appends one episode, and publishes the block when it is full.
@@ -68,67 +84,147 @@ class DatasetWriter:
         Raises:
             OSError: The disk is full or the folder not writable.
         """
-        if self._dataset is None:
-            self._begin()
-        for frame in demonstration.frames:
-            self._dataset.add_frame({**frame, "task": self._task})
-        with _lean_datasets(self._stage / "cache"):
-            self._dataset.save_episode()
-        self._in_block += 1
-        if self._in_block >= self._block:
+        if self._published is None:
+            self._published = _read_published(self._root, self._features)
+        if self._open is None:
+            shutil.rmtree(self._stage, ignore_errors=True)
+            self._open = _Block(self._published.data_files)
+        block, before = self._open, self._published
+        length, first = demonstration.length, before.frames + block.frames
+        episode = before.episodes + len(block.rows)
+        counters = files.counters(length, episode, first, self._fps)
+        stats = {**demonstration.stats, **column_stats(counters)}
+        table = files.data_table(self._schema, {**demonstration.columns, **counters})
+        # An interrupt in here would leave rows that are not listed.
+        block.torn = True
+        block.write(self._stage, table)
+        named = files.named_stats(self._features, stats)
+        block.rows.append(
+            files.episode_row(episode, length, first, block.data_file, self._task, named)
+        )
+        block.stats.append(stats)
+        block.frames += length
+        block.torn = False
+        if len(block.rows) >= self._block:
             self.publish()
 
     def publish(self) -> None:
-        """Finalises the open block, if any, and moves it into place."""
-        if self._dataset is None:
+        """Closes the open block, if any, and moves it into place."""
+        block, before = self._open, self._published
+        if block is None or before is None or block.torn or not block.rows:
+            self.discard()
             return
-        dataset, self._dataset, self._in_block = self._dataset, None, 0
-        dataset.finalize()
-        for part in ("data", str(_EPISODES)):
+        block.close()
+        names = files.with_counters(self._features)
+        parts = [before.stats, *block.stats] if before.stats else block.stats
+        after = _Published(
+            before.episodes + len(block.rows),
+            before.frames + block.frames,
+            block.data_file + 1,
+            before.episode_files + 1,
+            {name: merge_stats([part[name] for part in parts]) for name in names},
+        )
+        files.write_episodes(self._stage, before.episode_files, block.rows)
+        files.write_task(self._stage, self._task)
+        files.write_stats(self._stage, self._features, after.stats)
+        files.write_info(
+            self._stage, self._features, self._fps, ROBOT_TYPE, after.episodes, after.frames
+        )
+        for part in (files.DATA, files.EPISODES):
             for staged in sorted((self._stage / part).glob("*/*.parquet")):
                 target = self._root / staged.relative_to(self._stage)
-                if not target.exists():
-                    target.parent.mkdir(parents=True, exist_ok=True)
-                    staged.replace(target)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                staged.replace(target)
         for name in _COUNTS:
             (self._stage / name).replace(self._root / name)
+        self._published = after
         self.discard()
 
     def discard(self) -> None:
         """Drops the open block."""
-        self._dataset, self._in_block = None, 0
+        block, self._open = self._open, None
+        if block is not None:
+            # On a full disk, closing fails as well.
+            with contextlib.suppress(OSError):
+                block.close()
         shutil.rmtree(self._stage, ignore_errors=True)
 
-    def _begin(self) -> None:
-        """Opens a block: a dataset of its own, or the continuation of the published one."""
-        shutil.rmtree(self._stage, ignore_errors=True)
-        from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-        repo_id = f"local/{self._root.resolve().name}"
-        if not (self._root / _INFO).exists():
-            self._dataset = LeRobotDataset.create(
-                repo_id,
-                self._fps,
-                self._features,
-                root=self._stage,
-                robot_type=ROBOT_TYPE,
-                use_videos=False,
-                image_writer_threads=IMAGE_WRITER_THREADS,
-                video_backend=_UNUSED_VIDEO_BACKEND,
-            )
-            return
-        # To go on, LeRobot needs the counts and the last episode's row; all other files stay out,
-        # so that opening a block costs the same however long the dataset has become.
-        for name in (*_COUNTS, _episode_files(self._root)[-1].relative_to(self._root)):
-            (self._stage / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(self._root / name, self._stage / name)
-        with _lean_datasets(self._stage / "cache"):
-            self._dataset = LeRobotDataset.resume(
-                repo_id,
-                root=self._stage,
-                image_writer_threads=IMAGE_WRITER_THREADS,
-                video_backend=_UNUSED_VIDEO_BACKEND,
-            )
+class _Block:
+    """Episodes on their way: their data in the stage, what is said of them in memory.
+
+    Args:
+        data_file: Number of its first data file.
+    """
+
+    def __init__(self, data_file: int) -> None:
+        self.data_file = data_file
+        self.rows: list[dict[str, Any]] = []
+        self.stats: list[Mapping[str, FeatureStats]] = []
+        self.frames = 0
+        self.torn = False
+        self._writer: pq.ParquetWriter | None = None
+        self._path = Path()
+        self._frames_in_file = 0
+
+    def write(self, stage: Path, table: Any) -> None:
+        """Appends the rows of an episode, to a new file where LeRobot would begin one."""
+        if self._writer is not None:
+            size = self._path.stat().st_size / 2**20
+            if size * (1.0 + len(table) / self._frames_in_file) >= files.DATA_FILE_MB:
+                self.close()
+                self.data_file += 1
+        if self._writer is None:
+            self._path = stage / files.numbered(files.DATA, self.data_file)
+            self._writer = files.data_writer(self._path, table.schema)
+            self._frames_in_file = 0
+        self._writer.write_table(table)
+        self._frames_in_file += len(table)
+
+    def close(self) -> None:
+        """Writes the footer."""
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            writer.close()
+
+
+def _read_published(root: Path, features: Mapping[str, dict[str, Any]]) -> _Published:
+    """What a recording goes on from.
+
+    Raises:
+        DatasetError: ``info.json`` or ``stats.json`` is damaged.
+    """
+    if not (root / files.INFO).exists():
+        return _Published()
+    (episodes, frames), listed = _counts(root), _episode_files(root)
+    last = pq.read_table(listed[-1], columns=[*_DATA_PLACE, *_EPISODE_PLACE]).to_pylist()[-1]
+    data_file, episode_file = (
+        last[chunk] * files.FILES_A_CHUNK + last[file]
+        for chunk, file in (_DATA_PLACE, _EPISODE_PLACE)
+    )
+    names = files.with_counters(features)
+    try:
+        stats = _read_json(root / files.STATS)
+        # A kill between the last two files leaves statistics that count a block too many.
+        if stats["index"]["count"] == [frames]:
+            whole = {name: FeatureStats.from_named(stats[name]) for name in names}
+        else:
+            whole = _stats_of_episodes(listed, list(names))
+    except (KeyError, TypeError, ValueError) as error:
+        raise _damaged(root / files.STATS, error) from None
+    return _Published(episodes, frames, data_file + 1, episode_file + 1, whole)
+
+
+def _stats_of_episodes(listed: list[Path], names: list[str]) -> dict[str, FeatureStats]:
+    """Statistics of all episodes that are listed, merged."""
+    parts: dict[str, list[FeatureStats]] = {name: [] for name in names}
+    for path in listed:
+        for row in pq.read_table(path).to_pylist():
+            for name in names:
+                prefix = f"{files.STATS_PREFIX}{name}/"
+                named = {k.removeprefix(prefix): v for k, v in row.items() if k.startswith(prefix)}
+                parts[name].append(FeatureStats.from_named(named))
+    return {name: merge_stats(each) for name, each in parts.items()}
 
 
 def prepare_root(root: Path, *, resume: bool) -> None:
@@ -162,71 +258,70 @@ def published_outcomes(root: Path) -> list[bool]:
     Raises:
         DatasetError: The files and the counts contradict each other.
     """
-    if not (root / _INFO).exists():
+    if not (root / files.INFO).exists():
         return []
     outcomes: dict[int, bool] = {}
     for path in sorted((root / "data").glob("*/*.parquet")):
         table = pq.read_table(path, columns=["episode_index", "next.success"]).to_pydict()
         for episode, success in zip(table["episode_index"], table["next.success"], strict=True):
             outcomes[episode] = outcomes.get(episode, False) or bool(success)
-    count = _published_count(root)
+    count, _ = _counts(root)
     if sorted(outcomes) != list(range(count)):
         raise DatasetError(f"{root} counts {count} episodes but holds others; record it again")
     return [outcomes[episode] for episode in range(count)]
 
 
-def _published_count(root: Path) -> int:
+def _counts(root: Path) -> tuple[int, int]:
+    """Published episodes and frames.
+
+    Raises:
+        DatasetError: ``info.json`` is damaged.
+    """
+    info = _read_json(root / files.INFO)
     try:
-        return int(json.loads((root / _INFO).read_text(encoding="utf-8"))["total_episodes"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DatasetError(
-            f"{root / _INFO} is damaged ({error}); record the dataset again"
-        ) from None
+        return int(info["total_episodes"]), int(info["total_frames"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise _damaged(root / files.INFO, error) from None
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    """Reads a file of ``meta``.
+
+    Raises:
+        DatasetError: It is damaged.
+    """
+    try:
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise _damaged(path, error) from None
+    return content
+
+
+def _damaged(path: Path, error: Exception) -> DatasetError:
+    return DatasetError(f"{path} is damaged ({error}); record the dataset again")
 
 
 def _episode_files(root: Path) -> list[Path]:
-    return sorted((root / _EPISODES).glob("*/*.parquet"))
+    return sorted((root / files.EPISODES).glob("*/*.parquet"))
 
 
 def _drop_unpublished(root: Path) -> None:
     """Removes files of a block that was being moved into place when its recorder was killed."""
-    if not (root / _INFO).exists():
+    if not (root / files.INFO).exists():
         shutil.rmtree(root / "data", ignore_errors=True)
         shutil.rmtree(root / "meta", ignore_errors=True)
         return
-    count = _published_count(root)
+    count, _ = _counts(root)
     kept: set[tuple[int, int]] = set()
-    columns = ["episode_index", "data/chunk_index", "data/file_index"]
     for path in _episode_files(root):
-        rows = pq.read_table(path, columns=columns).to_pydict()
+        rows = pq.read_table(path, columns=["episode_index", *_DATA_PLACE]).to_pydict()
         if min(rows["episode_index"]) >= count:
             path.unlink()
         else:
-            kept |= set(zip(rows[columns[1]], rows[columns[2]], strict=True))
+            kept |= set(zip(*(rows[name] for name in _DATA_PLACE), strict=True))
     wanted = {
         root / "data" / f"chunk-{chunk:03d}" / f"file-{file:03d}.parquet" for chunk, file in kept
     }
     for path in (root / "data").glob("*/*.parquet"):
         if path not in wanted:
             path.unlink()
-
-
-@contextlib.contextmanager
-def _lean_datasets(cache: Path) -> Iterator[None]:
-    """Keeps Hugging Face's datasets from drawing bars, hashing and filling the user's cache."""
-    # By name: type checkers take the plain import for our own folder of that name.
-    datasets: Any = importlib.import_module("datasets")
-    config: Any = importlib.import_module("datasets.config")
-    folder, caching = config.HF_DATASETS_CACHE, datasets.is_caching_enabled()
-    bars = datasets.are_progress_bars_disabled()
-    config.HF_DATASETS_CACHE = cache
-    datasets.disable_caching()
-    datasets.disable_progress_bars()
-    try:
-        yield
-    finally:
-        config.HF_DATASETS_CACHE = folder
-        if caching:
-            datasets.enable_caching()
-        if not bars:
-            datasets.enable_progress_bars()

@@ -172,24 +172,24 @@ class Mover(Expert):
         super().__init__(cast("Environment", belief))
         self._belief = belief
 
-    def _ranked_goals(
+    def _reachable(
         self, q: FloatArray, velocity: FloatArray, position: FloatArray, normal: FloatArray
     ) -> FloatArray:
-        """Hover configurations (m, 7), the one reached soonest first, that have a short way on."""
-        ranked = super()._ranked_goals(q, velocity, position, normal)
-        if self._belief.descent is None or len(ranked) == 0:
-            return ranked
+        """Hover configurations (m, 7), in no order, that have a short way on."""
+        family = super()._reachable(q, velocity, position, normal)
+        if self._belief.descent is None or len(family) == 0:
+            return family
         onward = self._kinematics.goal_configurations_at_tool_angle(
-            self._belief.descent, _UP, ranked[0, 6], n_swivel=_N_DESCENT_SWIVEL
+            self._belief.descent, _UP, family[0, 6], n_swivel=_N_DESCENT_SWIVEL
         )
         if len(onward) == 0:
-            return ranked
-        seconds = np.zeros((len(ranked), len(onward)), np.float32)
-        for here, there, speed in zip(ranked.T, onward.T, JOINT_SPEED_RAD_S, strict=True):
+            return family
+        seconds = np.zeros((len(family), len(onward)), np.float32)
+        for here, there, speed in zip(family.T, onward.T, JOINT_SPEED_RAD_S, strict=True):
             way = np.subtract.outer(here.astype(np.float32), there.astype(np.float32))
             np.maximum(seconds, np.abs(way) / np.float32(speed), out=seconds)
         descent = seconds.min(axis=1)
-        return np.asarray(ranked[descent <= descent.min() + _DESCENT_SLACK_S])
+        return np.asarray(family[descent <= descent.min() + _DESCENT_SLACK_S])
 
 
 class Servo:

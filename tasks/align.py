@@ -328,15 +328,23 @@ class Align(ServoTask):
         data = physics.data.ptr
         scenario = self.scenario
         centre = scenario.target + scenario.normal * 2.0 * HALF_THICKNESS_M
-        u, v, depth = cameras.project(centre, camera.K, camera.T(data))
+        eye = data.cam_xpos[camera.id]
+        # ``cameras.project`` in plain floats: this is asked for every frame that is recorded.
+        ax, ay, az, bx, by, bz, cx, cy, cz = data.cam_xmat[camera.id].tolist()
+        dx, dy, dz = (centre - eye).tolist()
+        depth = -(az * dx + bz * dy + cz * dz)
+        if depth <= 0.0:
+            return np.zeros(4)
+        focal, middle = camera.K[0, 0].item(), camera.K[0, 2].item()
+        u = focal * (ax * dx + bx * dy + cx * dz) / depth + middle
+        v = -focal * (ay * dx + by * dy + cy * dz) / depth + middle
         # Pixel centres are whole, so the image spans from -1/2 to resolution - 1/2.
         x = 2.0 * (u + 0.5) / camera.resolution - 1.0
         y = 2.0 * (v + 0.5) / camera.resolution - 1.0
-        eye = data.cam_xpos[camera.id]
-        seen = depth > 0 and max(abs(x), abs(y)) <= 1.0 and (eye - centre) @ scenario.normal > 0
+        seen = max(abs(x), abs(y)) <= 1.0 and (eye - centre) @ scenario.normal > 0
         if not seen or self._is_occluded(physics, eye, centre, own=name == "eih"):
             return np.zeros(4)
-        diameter = camera.K[0, 0] * self.variant.target_diameter_m / depth / camera.resolution
+        diameter = focal * self.variant.target_diameter_m / depth / camera.resolution
         return np.array([x, y, diameter, 1.0])
 
     def joint_positions(self, physics: mjcf.Physics) -> FloatArray:

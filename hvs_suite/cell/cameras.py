@@ -6,6 +6,7 @@ lies at (W - 1) / 2. MuJoCo's camera frame has y up and z backward instead.
 """
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -106,10 +107,12 @@ class Camera:
     channels: int
     fov_deg: float
 
-    @property
+    @functools.cached_property
     def K(self) -> FloatArray:  # noqa: N802
-        """Intrinsics, (3, 3) px."""
-        return intrinsics(self.resolution, self.fov_deg)
+        """Intrinsics, (3, 3) px; read-only, because asked for every control step."""
+        matrix = intrinsics(self.resolution, self.fov_deg)
+        matrix.setflags(write=False)
+        return matrix
 
     def T(self, data: mujoco.MjData) -> FloatArray:  # noqa: N802
         """True extrinsics in the present state, (4, 4); privileged where the pose is disturbed."""

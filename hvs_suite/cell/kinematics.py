@@ -140,8 +140,22 @@ class Kinematics:
                 if abs(first.parentJoint - objects[j].parentJoint) > 2:
                     self.geometry.addCollisionPair(pin.CollisionPair(i, j))
         # Base and link 1 can never come closer to the surface than they stand.
-        self._movable = [i for i, g in enumerate(objects) if g.parentJoint >= 2]
-        shapes = [objects[i].geometry for i in self._movable]
+        movable = [g for g in objects if g.parentJoint >= 2]
+        joints = sorted({int(g.parentJoint) for g in movable})
+        # Rotations (3, 3) and origins (3, 1) of these joints: views into Pinocchio's own memory, so
+        # that nothing has to be fetched joint by joint.
+        poses = self._data.oMi
+        self._joint_frames = [
+            part for j in joints for part in (poses[j].rotation, poses[j].translation[:, None])
+        ]
+        # One row a body: the part of a direction's components along these frames that is its
+        # centre's, and its axis'; (2 n, 4 joints).
+        self._bodies = np.zeros((2 * len(movable), 4 * len(joints)))
+        for row, body in enumerate(movable):
+            columns = 4 * joints.index(int(body.parentJoint)) + np.arange(4)
+            self._bodies[row, columns] = np.append(body.placement.translation, 1.0)
+            self._bodies[len(movable) + row, columns[:3]] = body.placement.rotation[:, 2]
+        shapes = [g.geometry for g in movable]
         self._radius = np.array([shape.radius for shape in shapes])
         self._half_length = np.array([shape.halfLength for shape in shapes])
         self._is_cylinder = np.array([isinstance(shape, coal.Cylinder) for shape in shapes])
@@ -196,14 +210,13 @@ class Kinematics:
         q = np.asarray(q, dtype=np.float64)
         normal = np.asarray(surface_normal, dtype=np.float64)
         pin.updateGeometryPlacements(self.model, self._data, self.geometry, self._geometry_data, q)
-        placements = self._geometry_data.oMg
-        height = np.array([placements[i].translation @ normal for i in self._movable])
-        axis_z = np.array([placements[i].rotation[:, 2] @ normal for i in self._movable])
+        frames = np.concatenate(self._joint_frames, axis=1)
+        height, axis_z = (self._bodies @ (normal @ frames)).reshape(2, -1)
         # A capsule's end is a ball; a cylinder's a disc, whose rim dips by r sin(tilt).
         dip = np.where(self._is_cylinder, np.sqrt(np.maximum(0.0, 1.0 - axis_z**2)), 1.0)
         lowest = height - self._half_length * np.abs(axis_z) - self._radius * dip
-        pin.computeDistances(self.geometry, self._geometry_data)
-        between = min(result.min_distance for result in self._geometry_data.distanceResults)
+        nearest = pin.computeDistances(self.geometry, self._geometry_data)
+        between = self._geometry_data.distanceResults[nearest].min_distance
         return float(min(between, lowest.min() - surface_height_m * normal[2]))
 
     def inverse_kinematics(

@@ -1,0 +1,239 @@
+"""The files of a LeRobot dataset, format v3, as LeRobot 0.6 writes them, without importing it.
+
+Written with PyArrow and JSON alone: LeRobot's own writer goes through temporary PNG files and
+Hugging Face's ``datasets`` and takes 20 ms a frame, more than simulating it, and importing it takes
+10 to 20 s. The layout is small and versioned; a test holds these files against LeRobot's own.
+"""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from hvs_suite.datasets.episode_stats import FeatureStats
+
+INFO = "meta/info.json"
+STATS = "meta/stats.json"
+TASKS = "meta/tasks.parquet"
+DATA = "data"
+EPISODES = "meta/episodes"
+FILES_A_CHUNK = 1000
+DATA_FILE_MB = 100
+STATS_PREFIX = "stats/"
+
+_VERSION = "v3.0"
+_VIDEO_FILE_MB = 200
+_COUNTERS = {
+    "timestamp": "float32",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+}
+
+Columns = Mapping[str, npt.NDArray[Any] | Sequence[bytes]]
+Stats = Mapping[str, FeatureStats]
+
+
+def numbered(folder: str, number: int) -> str:
+    """Path of the file with this number, counted from 0 over all chunks, in ``folder``."""
+    chunk, file = divmod(number, FILES_A_CHUNK)
+    return f"{folder}/chunk-{chunk:03d}/file-{file:03d}.parquet"
+
+
+def counters(length: int, episode: int, first: int, fps: int) -> dict[str, npt.NDArray[Any]]:
+    """The columns (n,) that LeRobot adds to those of the features.
+
+    Args:
+        length: Frames of the episode.
+        episode: Its index.
+        first: Index of its first frame in the dataset.
+        fps: Frames a second.
+    """
+    frames = np.arange(length)
+    return {
+        "timestamp": frames / fps,
+        "frame_index": frames,
+        "episode_index": np.full(length, episode),
+        "index": first + frames,
+        "task_index": np.zeros(length, np.int64),
+    }
+
+
+def is_picture(feature: Mapping[str, Any]) -> bool:
+    """Whether a feature holds images."""
+    return bool(feature["dtype"] == "image")
+
+
+def with_counters(features: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """The features as ``info.json`` lists them."""
+    added = {
+        name: {"dtype": dtype, "shape": (1,), "names": None} for name, dtype in _COUNTERS.items()
+    }
+    return {**features, **added}
+
+
+def data_schema(features: Mapping[str, dict[str, Any]]) -> pa.Schema:
+    """Schema of the data files, with the note that tells Hugging Face's ``datasets`` of images.
+
+    Args:
+        features: LeRobot's, counters left out.
+    """
+    fields, notes = [], {}
+    for name, feature in with_counters(features).items():
+        note: dict[str, Any]
+        if is_picture(feature):
+            kind: pa.DataType = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+            note = {"_type": "Image"}
+        else:
+            kind = pa.bool_() if feature["dtype"] == "bool" else getattr(pa, feature["dtype"])()
+            note = {"dtype": feature["dtype"], "_type": "Value"}
+            if tuple(feature["shape"]) != (1,):
+                [size] = feature["shape"]
+                kind = pa.list_(kind, size)
+                note = {"feature": note, "length": size, "_type": "List"}
+        fields.append(pa.field(name, kind))
+        notes[name] = note
+    return pa.schema(fields, {"huggingface": json.dumps({"info": {"features": notes}})})
+
+
+def data_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
+    """Opens a data file; one row group an episode, as LeRobot has it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Extremes and dictionaries of PNG bytes would only fatten the file's footer.
+    plain = [field.name for field in schema if not pa.types.is_nested(field.type)]
+    return pq.ParquetWriter(
+        path, schema, compression="snappy", use_dictionary=plain, write_statistics=plain
+    )
+
+
+def data_table(schema: pa.Schema, columns: Columns) -> pa.Table:
+    """The rows of an episode.
+
+    Args:
+        schema: As ``data_schema`` gives it.
+        columns: Feature to values (n, k) or (n,), or to n PNG files.
+    """
+    return pa.Table.from_arrays(
+        [_array(field.type, columns[field.name]) for field in schema], schema=schema
+    )
+
+
+def episode_row(
+    episode: int, length: int, first: int, file: int, task: str, stats: Iterable[tuple[str, Any]]
+) -> dict[str, Any]:
+    """The row of an episode in ``meta/episodes``, the place of the row itself left out.
+
+    Args:
+        episode: Its index.
+        length: Its frames.
+        first: Index of its first frame in the dataset.
+        file: Number of its data file.
+        task: The task as a sentence.
+        stats: Feature and its named statistics.
+    """
+    chunk, place = divmod(file, FILES_A_CHUNK)
+    row = {
+        "episode_index": episode,
+        "tasks": [task],
+        "length": length,
+        "data/chunk_index": chunk,
+        "data/file_index": place,
+        "dataset_from_index": first,
+        "dataset_to_index": first + length,
+    }
+    for feature, named in stats:
+        row |= {f"{STATS_PREFIX}{feature}/{name}": value for name, value in named.items()}
+    return row
+
+
+def write_episodes(root: Path, number: int, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Writes a file of ``meta/episodes``."""
+    chunk, file = divmod(number, FILES_A_CHUNK)
+    place = {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
+    path = root / numbered(EPISODES, number)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(pa.Table.from_pylist([{**row, **place} for row in rows]), path)
+
+
+def write_task(root: Path, task: str) -> None:
+    """Writes ``meta/tasks.parquet`` with one task; pandas takes its sentence for the index."""
+    described = [
+        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": raw, "metadata": None}
+        for name, kind, raw in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
+    ]
+    whole = {"name": None, "field_name": None, "pandas_type": "unicode", "numpy_type": "object"}
+    pandas = {
+        "index_columns": ["task"],
+        "column_indexes": [{**whole, "metadata": {"encoding": "UTF-8"}}],
+        "columns": described,
+        "attributes": {},
+        "creator": {"library": "pyarrow", "version": pa.__version__},
+    }
+    table = pa.table({"task_index": pa.array([0], pa.int64()), "task": [task]})
+    pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(pandas)}), root / TASKS)
+
+
+def write_stats(root: Path, features: Mapping[str, dict[str, Any]], stats: Stats) -> None:
+    """Writes ``meta/stats.json``."""
+    _write_json(root / STATS, dict(named_stats(features, stats)))
+
+
+def named_stats(
+    features: Mapping[str, dict[str, Any]], stats: Stats
+) -> list[tuple[str, dict[str, Any]]]:
+    """Each feature with its statistics as LeRobot nests them, counters included."""
+    return [
+        (name, stats[name].named(picture=is_picture(feature)))
+        for name, feature in with_counters(features).items()
+    ]
+
+
+def write_info(
+    root: Path,
+    features: Mapping[str, dict[str, Any]],
+    fps: int,
+    robot: str,
+    episodes: int,
+    frames: int,
+) -> None:
+    """Writes ``meta/info.json``."""
+    content = {
+        "codebase_version": _VERSION,
+        "fps": fps,
+        "features": with_counters(features),
+        "total_episodes": episodes,
+        "total_frames": frames,
+        "total_tasks": 1,
+        "chunks_size": FILES_A_CHUNK,
+        "data_files_size_in_mb": DATA_FILE_MB,
+        "video_files_size_in_mb": _VIDEO_FILE_MB,
+        "data_path": DATA + "/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "video_path": None,
+        "robot_type": robot,
+        "splits": {"train": f"0:{episodes}"},
+    }
+    _write_json(root / INFO, content)
+
+
+def _array(kind: pa.DataType, values: npt.NDArray[Any] | Sequence[bytes]) -> pa.Array:
+    """A column of an episode in its type."""
+    if pa.types.is_struct(kind):
+        names = [f"frame-{frame:06d}.png" for frame in range(len(values))]
+        content = [pa.array(values, pa.binary()), pa.array(names, pa.string())]
+        return pa.StructArray.from_arrays(content, fields=list(kind))
+    flat = np.asarray(values).reshape(-1)
+    if pa.types.is_fixed_size_list(kind):
+        return pa.FixedSizeListArray.from_arrays(pa.array(flat, kind.value_type), type=kind)
+    # PyArrow narrows no float64 by itself.
+    return pa.array(flat.astype(kind.to_pandas_dtype(), copy=False), kind)
+
+
+def _write_json(path: Path, content: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content, indent=4, ensure_ascii=False), encoding="utf-8")
