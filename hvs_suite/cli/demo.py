@@ -34,7 +34,7 @@ class Demo:
 
     out: Path = Path("runs/demo")
     task: str = "align-easy"
-    episodes: int = 400
+    episodes: int = 1000
     minutes: float = 4.0
     dagger_rounds: int = 0
     evaluations: int = 50
