@@ -21,7 +21,7 @@ from websockets.sync.server import Server, ServerConnection, serve
 from hvs_suite.errors import HvsError, OptionError, PolicyError, ServerError
 from hvs_suite.eval import protocol, wire
 from hvs_suite.policies.context import PolicyContext
-from hvs_suite.rollout import Policy, one_torch_thread, seed_libraries
+from hvs_suite.rollout import Policy, library_seeds, one_torch_thread
 from hvs_suite.tasks import lock
 from hvs_suite.tasks.variants import TASKS
 
@@ -39,6 +39,7 @@ class Session:
     def __init__(self, policy: str) -> None:
         self._name = policy
         self._policy: Policy | None = None
+        self._seeds = contextlib.ExitStack()
 
     def answer(self, content: Any) -> bytes:
         """Returns the answer (bytes) to a message (bytes)."""
@@ -82,7 +83,8 @@ class Session:
         seed = message.get("seed")
         if type(seed) is not int or not 0 <= seed < 2**32:
             raise wire.WireError("a reset has a seed from 0 to 2^32 - 1")
-        seed_libraries(seed)
+        self._seeds.close()
+        self._seeds.enter_context(library_seeds(seed))
         return _guarded(policy.reset, lambda _: {"type": "done"})
 
     def _observe(self, policy: Policy, message: wire.Message) -> wire.Message:

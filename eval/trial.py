@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.eval.result_file import ERRORS, EpisodeRow
-from hvs_suite.rollout import Action, Observation, Policy, seed_libraries
+from hvs_suite.rollout import Action, Observation, Policy, library_seeds
 
 NOT_FINITE = "not finite"
 WRONG_SHAPE = "wrong shape"
@@ -243,10 +243,10 @@ def _play_policy(env: Stage, policy: Policy, scenario: int, limit_s: float) -> T
             raise
 
     def start() -> None:
-        seed_libraries(episode_seed(env.info["split"], scenario))
+        seeds.enter_context(library_seeds(episode_seed(env.info["split"], scenario)))
         guarded(policy.reset)
 
-    with _alarm_clock() as set_alarm:
+    with contextlib.ExitStack() as seeds, _alarm_clock() as set_alarm:
         row, actions, nearness = play_trial(env, start, decide, scenario)
     return Trial(
         row=row,

@@ -273,19 +273,30 @@ def _checked(action: Any, shape: Sequence[int], scenario: int, step: int) -> Act
     return checked
 
 
-def seed_libraries(seed: int) -> None:
-    """Starts the global generators of Python, NumPy and, if it is loaded, torch anew.
+@contextlib.contextmanager
+def library_seeds(seed: int) -> Iterator[None]:
+    """Starts the global generators of Python, NumPy and, if it is loaded, torch anew for a while.
 
     The suite uses none of them. Policies written elsewhere do (diffusion policies draw their noise
-    from torch's), and would otherwise depend on which scenarios a worker played before.
+    from torch's), and would otherwise depend on which scenarios a worker played before. Afterwards
+    the generators are as they were: the caller's own draws do not notice.
 
     Args:
         seed: In [0, 2^32).
     """
-    random.seed(seed)
-    np.random.seed(seed)  # noqa: NPY002 - this is the generator that others use
-    if (torch := sys.modules.get("torch")) is not None:
-        torch.manual_seed(seed)
+    torch = sys.modules.get("torch")
+    before = random.getstate(), np.random.get_state(), torch and torch.get_rng_state()  # noqa: NPY002
+    try:
+        random.seed(seed)
+        np.random.seed(seed)  # noqa: NPY002 - this is the generator that others use
+        if torch is not None:
+            torch.manual_seed(seed)
+        yield
+    finally:
+        random.setstate(before[0])
+        np.random.set_state(before[1])  # noqa: NPY002
+        if torch is not None:
+            torch.set_rng_state(before[2])
 
 
 @contextlib.contextmanager

@@ -3,6 +3,7 @@
 import json
 import multiprocessing
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -64,6 +65,14 @@ def test_a_policy_that_draws_from_global_generators_scores_the_same_in_any_order
     assert one.episodes == two.episodes
     assert one.metadata.policy_kind == "module"
     assert one.metadata.policy_hash is not None
+
+
+def test_evaluating_leaves_the_caller_s_global_generators_alone() -> None:
+    states = []
+    for _ in range(2):
+        states.append((random.getstate(), str(np.random.get_state())))  # noqa: NPY002
+        protocol.evaluate("broken_policies:draws", TASK, episodes=1)
+    assert states[0] == states[1]
 
 
 def test_a_policy_sees_what_the_preset_shows_and_nothing_else() -> None:
