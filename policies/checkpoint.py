@@ -5,10 +5,9 @@ alone: LeRobot's policies take ten seconds and a gigabyte to import, in every wo
 that both ways give the same action. Anything else goes through LeRobot.
 """
 
-import contextlib
 import dataclasses
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -25,7 +24,7 @@ from hvs_suite.policies.hvs.network import (
     HvsNetwork,
     shape_from_config,
 )
-from hvs_suite.rollout import Observation
+from hvs_suite.rollout import Observation, one_torch_thread
 from hvs_suite.tasks.variants import AlignVariant, observation_names
 
 Action = npt.NDArray[np.float32]
@@ -86,7 +85,7 @@ class CheckpointPolicy:
         config = read_config(folder)
         check_fit(config, folder, variant)
         self._inputs = tuple(config["input_features"])
-        with _one_thread():
+        with one_torch_thread():
             if config.get("type") == "hvs" and _processors_are_standard(folder):
                 self._decide, self._forget = _network(folder, config)
             else:
@@ -106,7 +105,7 @@ class CheckpointPolicy:
         Returns:
             (7,) float32.
         """
-        with _one_thread(), torch.inference_mode():
+        with one_torch_thread(), torch.inference_mode():
             action = self._decide(self._batch(observation))
         return np.array(action.reshape(-1).cpu().numpy(), np.float32)
 
@@ -270,14 +269,3 @@ def _lerobot(folder: Path, instruction: str) -> tuple[Decide, Callable[[], None]
         return action
 
     return decide, policy.reset
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Decide on one thread: as fast for one frame, and the sums are the same in every process."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -226,15 +226,7 @@ class _Run:
         """Open the dataset, decoding its frames unless the cache has them."""
         total = manifest.n_frames * max(1, len(manifest.cameras))
         started = time.perf_counter()
-        done = 0
-
-        def note(count: int) -> None:
-            nonlocal done
-            done += count
-            rate = done / max(1e-9, time.perf_counter() - started)
-            self._report("decoding", done / total, done, rate, (total - done) / rate)
-
-        demonstrations = Demonstrations(manifest, cache, seed, note)
+        demonstrations = Demonstrations(manifest, cache, seed, self._meter("decoding", total))
         self._decode_s = time.perf_counter() - started
         return demonstrations
 
@@ -258,8 +250,9 @@ class _Run:
         optimizer = torch.optim.AdamW(policy.parameters(), lr=learning_rate, weight_decay=decay)
         self._counters = load_state(state, policy, optimizer)
         due = round_shares(rounds.count)
-        while len(self._rounds) < rounds.count and self._reopen(demonstrations, rounds):
-            pass
+        for number in range(rounds.count):
+            if not self._reopen(demonstrations, rounds.path(number)):
+                break
         order = _Order(demonstrations.training, batch_size, seed)
         before_s = self._counters.elapsed_s
         begun = budget.share(self._counters)
@@ -323,9 +316,9 @@ class _Run:
             n_parameters=sum(p.numel() for p in policy.parameters()),
         )
 
-    def _reopen(self, demonstrations: Demonstrations, rounds: _Rounds) -> bool:
-        """Learn from the next round if an earlier sitting played it."""
-        found = read_round(rounds.path(len(self._rounds)))
+    def _reopen(self, demonstrations: Demonstrations, folder: Path) -> bool:
+        """Learn from a round if it was played."""
+        found = read_round(folder)
         if found is None:
             return False
         summary, recording = found
@@ -335,28 +328,18 @@ class _Run:
 
     def _play_round(self, demonstrations: Demonstrations, rounds: _Rounds) -> None:
         """Play the next round with the checkpoint just written, and learn from it."""
-        started = time.perf_counter()
-        done = 0
-
-        def note(count: int) -> None:
-            nonlocal done
-            done += count
-            rate = done / max(1e-9, time.perf_counter() - started)
-            left = (rounds.frames - done) / max(1e-9, rate)
-            self._report("playing", done / rounds.frames, done, rate, left)
-
-        manifest = demonstrations.manifest
+        manifest, folder = demonstrations.manifest, rounds.path(len(self._rounds))
         first = self._rounds[-1].next_scenario if self._rounds else manifest.n_episodes
         play_round(
             manifest,
             self._out,
-            rounds.path(len(self._rounds)),
+            folder,
             frames=rounds.frames,
             first_scenario=first,
             workers=rounds.workers,
-            on_frames=note,
+            on_frames=self._meter("playing", rounds.frames),
         )
-        self._reopen(demonstrations, rounds)
+        self._reopen(demonstrations, folder)
 
     def _checkpoint(
         self,
@@ -373,6 +356,19 @@ class _Run:
         _log(writer, self._counters.step, {f"held_out/{name}": v for name, v in parts.items()})
         save_state(state, policy, optimizer, self._counters)
         save_checkpoint(policy, self._out)
+
+    def _meter(self, stage: str, total: int) -> Callable[[int], None]:
+        """Counts the frames of a stage and reports its rate and time left."""
+        started = time.perf_counter()
+        done = 0
+
+        def note(count: int) -> None:
+            nonlocal done
+            done += count
+            rate = done / max(1e-9, time.perf_counter() - started)
+            self._report(stage, done / total, done, rate, (total - done) / max(1e-9, rate))
+
+        return note
 
     def _report_training(self, share: float, begun: float) -> None:
         """Report, with the time left if the budget goes on shrinking at this sitting's rate."""
