@@ -32,8 +32,8 @@ HELD_OUT_SHARE = 0.05
 # Philox words that keep this stream apart from the training order.
 HELD_OUT_STREAM = 1
 MEMORY_STREAM = 3
-# How well a trained eye places the target, one sigma: the eye to hand; the eye in hand, as a share of
-# the distance and at the least.
+# How well a trained eye places the target, one sigma: the eye to hand; the eye in hand, as a share
+# of the distance and at the least.
 AFAR_SIGMA_M = 0.003
 HAND_SIGMA = 0.006
 HAND_SIGMA_M = 0.0002
