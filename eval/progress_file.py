@@ -90,6 +90,7 @@ class ProgressFile:
                 "shape": trial.actions.shape,
                 "decision_s": trial.decision_s,
                 "slowest_s": trial.slowest_s,
+                "play_s": trial.play_s,
                 "elapsed_s": elapsed_s,
             },
         )
@@ -132,6 +133,7 @@ class ProgressFile:
                 actions=actions.reshape(kept["shape"]),
                 decision_s=float(kept["decision_s"]),
                 slowest_s=float(kept["slowest_s"]),
+                play_s=float(kept["play_s"]),
                 detail="",
                 nearness=float("inf"),
             )

@@ -249,7 +249,7 @@ def evaluate(
             timings=result_file.Timings(
                 workers=workers,
                 wall_s=wall_s,
-                steps_per_s=steps / wall_s,
+                steps_per_s=steps * min(workers, episodes) / sum(t.play_s for t in trials),
                 decision_ms=1000 * sum(trial.decision_s for trial in trials) / max(steps, 1),
                 decision_ms_max=1000 * max(trial.slowest_s for trial in trials),
             ),

@@ -397,7 +397,8 @@ class Timings(_Block):
     Attributes:
         workers: Processes that shared the work, in the last sitting.
         wall_s: Wall time of the evaluation over all sittings, start of the workers included (s).
-        steps_per_s: Control steps a second over that time, all workers together.
+        steps_per_s: Control steps a second of all workers together while they play, resets
+            included; what `hvs bench` measures as well.
         decision_ms: Mean wall time of one `select_action` (ms).
         decision_ms_max: The longest (ms).
     """

@@ -104,6 +104,7 @@ class Trial:
         actions: (settled_steps, 7) float32, as the policy gave them, before clipping.
         decision_s: Wall time spent in the policy, summed (s).
         slowest_s: Its longest decision (s).
+        play_s: Wall time of the whole trial in the process that played it, reset included (s).
         detail: What the policy said when it failed; empty if it did not.
         nearness: Least distance of an error to its tolerance at the end of any control step, in
             units of `NEAR_MM` and `NEAR_DEG`: below 1, rounding may have decided the outcome.
@@ -113,6 +114,7 @@ class Trial:
     actions: npt.NDArray[np.float32]
     decision_s: float
     slowest_s: float
+    play_s: float
     detail: str
     nearness: float
 
@@ -242,6 +244,8 @@ def _play_policy(env: Stage, policy: Policy, scenario: int, limit_s: float) -> T
             detail = failure.detail
             raise
 
+    begun = time.perf_counter()
+
     def start() -> None:
         seeds.enter_context(library_seeds(episode_seed(env.info["split"], scenario)))
         guarded(policy.reset)
@@ -253,6 +257,7 @@ def _play_policy(env: Stage, policy: Policy, scenario: int, limit_s: float) -> T
         actions=actions,
         decision_s=sum(times),
         slowest_s=max(times),
+        play_s=time.perf_counter() - begun,
         detail=detail,
         nearness=nearness,
     )
