@@ -137,8 +137,9 @@ def test_it_searches(view: Any) -> None:
 def test_it_opens_an_entry_and_closes_it(view: Any) -> None:
     link = view.locator("#align-hard-v1 tbody th a", has_text="beta")
     link.click()
+    # An address changes before the page hears of it: opening and closing are waited for.
     sheet = view.locator("dialog[open]")
-    assert sheet.count() == 1
+    sheet.wait_for()
     assert sheet.locator("h2").inner_text().split() == ["beta", "align-hard-v1"]
     assert sheet.locator("dl.figures").inner_text().count("3 of 10") == 1
     view.wait_for_function(
@@ -150,13 +151,13 @@ def test_it_opens_an_entry_and_closes_it(view: Any) -> None:
     assert width[0] <= width[1]
     place = view.evaluate("scrollY")
     view.keyboard.press("Escape")
-    view.wait_for_function("!document.querySelector('dialog[open]')")
+    sheet.wait_for(state="detached")
     # The reader is where they were, and the same entry opens once more.
-    assert view.evaluate("scrollY") == place
+    view.wait_for_function("place => scrollY === place", arg=place)
     link.click()
-    assert view.locator("dialog[open]").count() == 1
-    view.locator("dialog[open] header button").click()
-    assert view.locator("dialog[open]").count() == 0
+    sheet.wait_for()
+    sheet.locator("header button").click()
+    sheet.wait_for(state="detached")
 
 
 def test_an_entry_has_an_address(view: Any, board: Path) -> None:
@@ -168,6 +169,7 @@ def test_an_entry_has_an_address(view: Any, board: Path) -> None:
 def test_pointing_at_a_policy_picks_out_its_curves(view: Any) -> None:
     view.locator("#align-easy-v1 .legend button", has_text="alpha").hover()
     faint = view.locator("#align-easy-v1 g.faint")
+    faint.first.wait_for(state="attached")
     assert sorted({g.get_attribute("data-policy") for g in faint.all()}) == [
         "beta",
         "gamma-long-name",
