@@ -4,13 +4,17 @@ PY := .venv/bin/python
 # Two test workers on two cores: more threads inside each would only fight over them.
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 --dist loadfile
 
-.PHONY: help demo test test-full lint lock certificates clean
+.PHONY: help demo reproduce test test-full lint lock certificates clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*##/\t/' | expand -t 12
 
 demo: .venv/.up-to-date  ## record, learn, score and film, in runs/demo (under 10 minutes)
 	@.venv/bin/hvs demo --out runs/demo --overwrite
+
+TASK ?= align-thesis
+reproduce: .venv/.up-to-date  ## record, pretrain and evaluate TASK's shipped policy anew, in runs/
+	@.venv/bin/hvs reproduce --task $(TASK)
 
 test: lint  ## ruff, mypy and every behaviour once (under 15 minutes)
 	@$(PYTEST) -m "not slow"

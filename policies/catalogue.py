@@ -5,6 +5,7 @@ from pathlib import Path
 
 from hvs_suite.errors import PolicyError
 from hvs_suite.policies import hub, imported
+from hvs_suite.policies.recipe import trained_on
 from hvs_suite.registry import find
 from hvs_suite.rollout import PolicyFactory
 
@@ -35,7 +36,7 @@ def policy_factory(spec: str, task: str) -> PolicyFactory:
     if spec in BUILTIN:
         return _builtin(spec)
     if spec in SHIPPED:
-        folder = HERE / spec / task
+        folder = HERE / spec / trained_on(task)
         if not folder.is_dir():
             raise PolicyError(
                 f"this version ships no {spec} weights for {task}; train your own with hvs pretrain"

@@ -6,7 +6,7 @@ package, which takes longer than opening a small dataset.
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from hvs_suite.datasets.metadata import read_metadata
-from hvs_suite.errors import DatasetError
+from hvs_suite.errors import DatasetError, OptionError
 from hvs_suite.policies.frame_cache import Frames, OnFrames, cached_frames, data_files
 from hvs_suite.policies.hvs.geometry import Calibration, calibrate, flange_motion
 from hvs_suite.policies.hvs.network import IMAGE_PREFIX, MEMORY, MEMORY_SIZE, N_JOINTS, STATE
@@ -27,6 +27,7 @@ EPISODE = "episode_index"
 GOAL_POSITION = "privileged.goal_position"
 GOAL_NORMAL = "privileged.goal_normal"
 TARGET_PREFIX = "privileged.target_"
+JOINTS = "joints"
 # Held out from training to measure the loss on; whole episodes, so that no neighbour frame leaks.
 HELD_OUT_SHARE = 0.05
 # Philox words that keep this stream apart from the training order.
@@ -94,6 +95,24 @@ class Manifest:
         wanted |= {IMAGE_PREFIX + name for name in self.cameras}
         return [key for key in self.features if key in wanted]
 
+    def with_inputs(self, names: Collection[str]) -> "Manifest":
+        """The same dataset for a policy that is given less.
+
+        Args:
+            names: Of ``eih``, ``eth`` and ``joints``.
+
+        Raises:
+            OptionError: A name is unknown, or no camera is left.
+        """
+        available = {**{name: IMAGE_PREFIX + name for name in self.cameras}, JOINTS: STATE}
+        if unknown := sorted(set(names) - set(available)):
+            raise OptionError(f"unknown input {unknown[0]!r}; choose from {', '.join(available)}")
+        if not set(names) & set(self.cameras):
+            raise OptionError("no camera is left to see the target with; keep eih or eth")
+        dropped = {key for name, key in available.items() if name not in names}
+        features = {key: value for key, value in self.features.items() if key not in dropped}
+        return dataclasses.replace(self, features=features)
+
 
 def read_manifest(root: Path) -> Manifest:
     """Read ``meta/info.json`` and ``hvs.json``.
@@ -149,6 +168,7 @@ class Demonstrations:
         manifest: Of the dataset.
         cache: Folder for decoded frames.
         seed: Chooses the held-out episodes.
+        episodes: Learn from the first so many alone; None from all.
         on_frames: Called with the number of frames just decoded, over all cameras.
 
     Attributes:
@@ -161,7 +181,13 @@ class Demonstrations:
     """
 
     def __init__(
-        self, manifest: Manifest, cache: Path, seed: int, on_frames: OnFrames | None = None
+        self,
+        manifest: Manifest,
+        cache: Path,
+        seed: int,
+        *,
+        episodes: int | None = None,
+        on_frames: OnFrames | None = None,
     ) -> None:
         self.manifest = manifest
         columns = _read_columns(manifest)
@@ -178,13 +204,13 @@ class Demonstrations:
         self._seed = seed
         self._recordings = [self._with_memory(Recording(columns, images), 0)]
         self._starts = np.array([0])
-        episodes = columns[EPISODE]
-        names = np.unique(episodes)
+        owner = columns[EPISODE]
+        names = np.unique(owner)[:episodes]
         stream = np.random.Generator(np.random.Philox(key=[seed, HELD_OUT_STREAM]))
         n_held_out = max(1, round(HELD_OUT_SHARE * len(names))) if len(names) > 1 else 0
-        held_out = np.isin(episodes, stream.permutation(names)[:n_held_out])
-        self.training = np.flatnonzero(~held_out)
-        self.held_out = np.flatnonzero(held_out)
+        shuffled = stream.permutation(names)
+        self.training = np.flatnonzero(np.isin(owner, shuffled[n_held_out:]))
+        self.held_out = np.flatnonzero(np.isin(owner, shuffled[:n_held_out]))
 
     def add(self, recording: Recording) -> None:
         """Learn from more frames, all of them.

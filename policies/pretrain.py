@@ -18,18 +18,23 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from hvs_suite.errors import OptionError, OutputError
-from hvs_suite.files import check_writable, replacing
+from hvs_suite.errors import OptionError
+from hvs_suite.files import replacing
 from hvs_suite.policies.dagger import RoundSummary, play_round, read_round, round_shares
 from hvs_suite.policies.demonstrations import (
     Demonstrations,
     Manifest,
-    calibration_of,
     read_manifest,
     refuse_test_split,
 )
 from hvs_suite.policies.frame_cache import fingerprint
-from hvs_suite.policies.hvs.network import IMAGE_PREFIX, STATE, Eye
+from hvs_suite.policies.pretrain_settings import (
+    Settings,
+    claim,
+    new_policy,
+    tightest_scale,
+    write_config,
+)
 from hvs_suite.policies.training_state import Counters, load_state, save_state
 
 if TYPE_CHECKING:
@@ -109,6 +114,10 @@ def pretrain(
     learning_rate: float = 2e-3,
     dagger_rounds: int = 0,
     dagger_frames: int = 6000,
+    inputs: tuple[str, ...] | None = None,
+    episodes: int | None = None,
+    keypoint_weight: float = 1.0,
+    error_scale: float | None = None,
     workers: int = 2,
     checkpoint_period_s: float = 60.0,
     on_progress: Callable[[Progress], None] | None = None,
@@ -127,6 +136,10 @@ def pretrain(
         dagger_rounds: How often to let the policy play, the expert labelling every step, and to add
             those frames. The budget counts training only.
         dagger_frames: Frames a round.
+        inputs: What the policy is given, of ``eih``, ``eth`` and ``joints``; None for all.
+        episodes: Learn from the first so many demonstrations alone; None from all.
+        keypoint_weight: Weight of the supervision by ``privileged.*``; 0 trains on actions alone.
+        error_scale: See `HvsConfig`; None for five times the task's tightest tolerance.
         workers: Processes that play the rounds; any number gives the same.
         checkpoint_period_s: Time between checkpoints (s).
         on_progress: Called while decoding and after every step.
@@ -139,32 +152,38 @@ def pretrain(
         OptionError: No budget, or a number that makes no sense.
         OutputError: ``out`` cannot be written, or holds something else than this run.
     """
-    _check_options(minutes, steps, batch_size, learning_rate)
-    _check_rounds(dagger_rounds, dagger_frames, workers)
+    _check_budget(minutes, steps)
+    if workers < 1:
+        raise OptionError(f"workers must be at least 1, not {workers}")
     manifest = read_manifest(data)
     refuse_test_split(manifest)
-    torch.set_num_threads(min(2, os.cpu_count() or 1))
-    settings: dict[str, Any] = {
-        "seed": seed,
-        "batch_size": batch_size,
-        "learning_rate": learning_rate,
-        "dagger_rounds": dagger_rounds,
-        "dagger_frames": dagger_frames,
-        "dataset": fingerprint(data),
-        "task": manifest.task,
-    }
-    _claim(out, settings)
-    training = out / "training"
-    policy = _new_policy(manifest, seed, learning_rate)
-    _write_config(out, data, settings, minutes, steps, policy)
-    run = _Run(out, on_progress)
-    demonstrations = run.decode(manifest, training / "cache", seed)
-    run.train(
-        policy,
-        demonstrations,
+    settings = Settings(
         seed=seed,
         batch_size=batch_size,
         learning_rate=learning_rate,
+        dagger_rounds=dagger_rounds,
+        dagger_frames=dagger_frames,
+        dataset=fingerprint(data),
+        task=manifest.task,
+        inputs=inputs,
+        episodes=episodes,
+        keypoint_weight=keypoint_weight,
+        error_scale=tightest_scale(manifest) if error_scale is None else error_scale,
+    )
+    settings.check(manifest)
+    if inputs is not None:
+        manifest = manifest.with_inputs(inputs)
+    torch.set_num_threads(min(2, os.cpu_count() or 1))
+    claim(out, settings)
+    training = out / "training"
+    policy = new_policy(manifest, settings)
+    write_config(out, data, settings, {"minutes": minutes, "steps": steps}, policy)
+    run = _Run(out, on_progress)
+    demonstrations = run.decode(manifest, training / "cache", settings)
+    run.train(
+        policy,
+        demonstrations,
+        settings,
         budget=_Budget(steps, None if minutes is None else 60.0 * minutes),
         rounds=_Rounds(training / "dagger", dagger_rounds, dagger_frames, workers),
         checkpoint_period_s=checkpoint_period_s,
@@ -222,11 +241,17 @@ class _Run:
         self._loss = math.nan
         self._held_out_loss = math.nan
 
-    def decode(self, manifest: Manifest, cache: Path, seed: int) -> Demonstrations:
+    def decode(self, manifest: Manifest, cache: Path, settings: Settings) -> Demonstrations:
         """Open the dataset, decoding its frames unless the cache has them."""
         total = manifest.n_frames * max(1, len(manifest.cameras))
         started = time.perf_counter()
-        demonstrations = Demonstrations(manifest, cache, seed, self._meter("decoding", total))
+        demonstrations = Demonstrations(
+            manifest,
+            cache,
+            settings.seed,
+            episodes=settings.episodes,
+            on_frames=self._meter("decoding", total),
+        )
         self._decode_s = time.perf_counter() - started
         return demonstrations
 
@@ -234,10 +259,8 @@ class _Run:
         self,
         policy: "HvsPolicy",
         demonstrations: Demonstrations,
+        settings: Settings,
         *,
-        seed: int,
-        batch_size: int,
-        learning_rate: float,
         budget: _Budget,
         rounds: _Rounds,
         checkpoint_period_s: float,
@@ -246,14 +269,15 @@ class _Run:
         from torch.utils.tensorboard import SummaryWriter
 
         state = self._out / "training" / "state.safetensors"
+        rate, batch_size = settings.learning_rate, settings.batch_size
         decay = policy.config.optimizer_weight_decay
-        optimizer = torch.optim.AdamW(policy.parameters(), lr=learning_rate, weight_decay=decay)
+        optimizer = torch.optim.AdamW(policy.parameters(), lr=rate, weight_decay=decay)
         self._counters = load_state(state, policy, optimizer)
         due = round_shares(rounds.count)
         for number in range(rounds.count):
             if not self._reopen(demonstrations, rounds.path(number)):
                 break
-        order = _Order(demonstrations.training, batch_size, seed)
+        order = _Order(demonstrations.training, batch_size, settings.seed)
         before_s = self._counters.elapsed_s
         begun = budget.share(self._counters)
         started = last_checkpoint = time.perf_counter()
@@ -268,13 +292,13 @@ class _Run:
                     paused = time.perf_counter()
                     self._checkpoint(policy, optimizer, demonstrations, state, writer)
                     self._play_round(demonstrations, rounds)
-                    order = _Order(demonstrations.training, batch_size, seed)
+                    order = _Order(demonstrations.training, batch_size, settings.seed)
                     pause = time.perf_counter() - paused
                     started, last_checkpoint = started + pause, time.perf_counter()
                     self._play_s += pause
                 step = self._counters.step
                 for group in optimizer.param_groups:
-                    group["lr"] = learning_rate * _schedule(share)
+                    group["lr"] = rate * _schedule(share)
                 fetched = time.perf_counter()
                 batch = demonstrations.batch(order.indices(step))
                 self._data_s += time.perf_counter() - fetched
@@ -450,107 +474,12 @@ def _held_out(policy: "HvsPolicy", demonstrations: Demonstrations) -> dict[str, 
     return {name: value / len(indices) for name, value in sums.items()}
 
 
-def _new_policy(manifest: Manifest, seed: int, learning_rate: float) -> "HvsPolicy":
-    """A fresh policy for a dataset's inputs, its cameras calibrated from the dataset."""
-    from lerobot.configs import FeatureType, PolicyFeature
-
-    from hvs_suite.policies.hvs.configuration_hvs import HvsConfig
-    from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
-
-    inputs = {
-        IMAGE_PREFIX + name: PolicyFeature(FeatureType.VISUAL, (shape[2], shape[0], shape[1]))
-        for name, shape in manifest.cameras.items()
-    }
-    if STATE in manifest.features:
-        shape = tuple(manifest.features[STATE]["shape"])
-        inputs[STATE] = PolicyFeature(FeatureType.STATE, shape)
-    config = HvsConfig(
-        input_features=inputs,
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},
-        device="cpu",
-        push_to_hub=False,
-        optimizer_lr=learning_rate,
-    )
-    # torch initialises weights from its global generator; leave that as it was found.
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        policy = HvsPolicy(config)
-    if STATE in manifest.features:
-        policy.network.set_calibration(calibration_of(manifest.root))
-    for module in policy.modules():
-        if isinstance(module, Eye):
-            module.train_in_bfloat16 = torch.cpu._is_avx512_bf16_supported()
-    return policy
-
-
-def _check_options(
-    minutes: float | None, steps: int | None, batch_size: int, learning_rate: float
-) -> None:
+def _check_budget(minutes: float | None, steps: int | None) -> None:
     if minutes is None and steps is None:
         raise OptionError("say how long to train: give minutes or steps")
     for name, value in (("minutes", minutes), ("steps", steps)):
         if value is not None and not (value > 0 and math.isfinite(value)):
             raise OptionError(f"{name} must be above 0, not {value}")
-    if batch_size < 1:
-        raise OptionError(f"batch_size must be at least 1, not {batch_size}")
-    if not 0.0 < learning_rate < 1.0:
-        raise OptionError(f"learning_rate must be between 0 and 1, not {learning_rate}")
-
-
-def _check_rounds(rounds: int, frames: int, workers: int) -> None:
-    if rounds < 0:
-        raise OptionError(f"dagger_rounds must be 0 or more, not {rounds}")
-    for name, value in (("dagger_frames", frames), ("workers", workers)):
-        if value < 1:
-            raise OptionError(f"{name} must be at least 1, not {value}")
-
-
-def _claim(out: Path, settings: Mapping[str, Any]) -> None:
-    """Take the folder, or recognise it as an interrupted run with the same settings."""
-    config = out / "train_config.json"
-    check_writable(config)
-    try:
-        begun = json.loads(config.read_text())["settings"]
-    except OSError:
-        if any(out.iterdir()):
-            raise OutputError(f"{out} is not empty; name another --out") from None
-        return
-    except (ValueError, KeyError, TypeError):
-        raise OutputError(f"{config} is damaged; name another --out") from None
-    differing = sorted(k for k in settings if begun.get(k) != settings[k])
-    if differing:
-        raise OutputError(
-            f"{out} holds a run with another {', '.join(differing)}; name another --out"
-        )
-
-
-def _write_config(
-    out: Path,
-    data: Path,
-    settings: Mapping[str, Any],
-    minutes: float | None,
-    steps: int | None,
-    policy: "HvsPolicy",
-) -> None:
-    from importlib.metadata import version
-
-    content = {
-        "format": 1,
-        "data": str(data),
-        "settings": settings,
-        "budget": {"minutes": minutes, "steps": steps},
-        "policy": {
-            "type": "hvs",
-            "channels": policy.config.channels,
-            "hidden": policy.config.hidden,
-            "keypoint_weight": policy.config.keypoint_weight,
-            "weight_decay": policy.config.optimizer_weight_decay,
-        },
-        "versions": {name: version(name) for name in ("hvs-suite", "lerobot", "numpy", "torch")},
-        "threads": torch.get_num_threads(),
-    }
-    with replacing(out / "train_config.json") as temporary:
-        temporary.write_text(json.dumps(content, indent=2) + "\n")
 
 
 def _log(writer: Any, step: int, values: Mapping[str, float]) -> None:

@@ -149,3 +149,31 @@ def _plain_meter() -> Callable[[str, float, str], None]:
             print(f"{stage}: {100.0 * share:.0f} %, {words}", file=sys.stderr, flush=True)
 
     return update
+
+
+@contextlib.contextmanager
+def stage(title: str, times_s: dict[str, float]) -> Iterator[None]:
+    """Announce a stage of long work and note how long it took.
+
+    Args:
+        title: The stage, in a few words.
+        times_s: Gets the time of the stage under its title (s).
+    """
+    print(f"== {title}", flush=True)
+    started = time.monotonic()
+    yield
+    times_s[title] = time.monotonic() - started
+    print(f"   {times_s[title]:.0f} s", flush=True)
+
+
+def print_times(times_s: Mapping[str, float]) -> None:
+    """Print a table of stages and their sum.
+
+    Args:
+        times_s: As `stage` fills it (s).
+    """
+    times = {**times_s, "all": sum(times_s.values())}
+    print_table(
+        ("stage", "minutes", "hours"),
+        [(name, f"{taken / 60:.1f}", f"{taken / 3600:.2f}") for name, taken in times.items()],
+    )

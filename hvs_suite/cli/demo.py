@@ -3,9 +3,6 @@
 import dataclasses
 import json
 import shutil
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from hvs_suite.cli import console
@@ -57,7 +54,7 @@ class Demo:
         result = results / "demo" / f"{self.task}.json"
         times_s: dict[str, float] = {}
 
-        with _stage(f"record {self.episodes} demonstrations of {self.task}", times_s):
+        with console.stage(f"record {self.episodes} demonstrations of {self.task}", times_s):
             Record(
                 task=self.task,
                 episodes=self.episodes,
@@ -66,11 +63,11 @@ class Demo:
                 noise=NOISE_RAD,
                 workers=2,
             ).run()
-        with _stage(f"train a policy on them for {self.minutes:g} min", times_s):
+        with console.stage(f"train a policy on them for {self.minutes:g} min", times_s):
             Pretrain(
                 data=dataset, out=policy, minutes=self.minutes, dagger_rounds=self.dagger_rounds
             ).run()
-        with _stage(f"score it on {self.evaluations} test scenarios", times_s):
+        with console.stage(f"score it on {self.evaluations} test scenarios", times_s):
             Evaluate(
                 policy=str(policy),
                 task=(self.task,),
@@ -79,9 +76,9 @@ class Demo:
                 workers=2,
                 out=result,
             ).run()
-        with _stage("build the board", times_s):
+        with console.stage("build the board", times_s):
             Leaderboard(results=results, out=board).run()
-        with _stage("film an episode", times_s):
+        with console.stage("film an episode", times_s):
             film_one(policy, self.task, _solved_scenario(result), film)
 
         self._report(result, board, times_s)
@@ -108,13 +105,7 @@ class Demo:
         """Print the policy's success as it is, where everything lies, and what it took."""
         summary = json.loads(result.read_text(encoding="utf-8"))["summary"]
         low, high = summary["pc_success_ci95"]
-        console.print_table(
-            ("stage", "seconds"),
-            [
-                *((name, f"{taken:.0f}") for name, taken in times_s.items()),
-                ("all", f"{sum(times_s.values()):.0f}"),
-            ],
-        )
+        console.print_times(times_s)
         print(
             f"{self.task}, the demo's own policy: {summary['n_success']} of "
             f"{summary['n_episodes']} solved, {summary['pc_success']:.1f} % "
@@ -155,13 +146,3 @@ def film_one(policy: Path, task: str, scenario: int, film: Path) -> None:
         episode, frames = pictures.film_episode(env, player, scenario)
         pictures.write_film(film, frames, 0.5 / env.variant.control_period_s)
     print(describe(episode, "the demo's policy"))
-
-
-@contextmanager
-def _stage(title: str, times_s: dict[str, float]) -> Iterator[None]:
-    """Announce a stage and note how long it took."""
-    print(f"== {title}", flush=True)
-    started = time.monotonic()
-    yield
-    times_s[title] = time.monotonic() - started
-    print(f"   {times_s[title]:.0f} s", flush=True)

@@ -38,6 +38,7 @@ COMMANDS = {
     "bench": "hvs_suite.cli.bench:Bench",
     "doctor": "hvs_suite.cli.doctor:Doctor",
     "demo": "hvs_suite.cli.demo:Demo",
+    "reproduce": "hvs_suite.cli.reproduce:Reproduce",
 }
 
 USER_ERROR = 2

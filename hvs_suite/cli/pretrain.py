@@ -30,6 +30,12 @@ class Pretrain:
         dagger_rounds: DAgger rounds, spread over the training: the policy plays, the expert labels
             every step, and the frames are added. Their time comes on top of --minutes.
         dagger_frames: Frames a round.
+        inputs: What the policy is given: names joined by +, such as eih+joints; all of eih, eth
+            and joints by default.
+        episodes: Learn from the first so many demonstrations alone.
+        keypoint_weight: Weight of the supervision by where the target is; 0 trains on actions.
+        error_scale: Errors of a joint's step (rad) and of a place (m) weigh linearly below this
+            and logarithmically above; five times the task's tightest tolerance by default.
         workers: Processes that play the rounds.
         seed: Of initial weights, held-out episodes and order.
     """
@@ -40,6 +46,10 @@ class Pretrain:
     steps: int | None = None
     dagger_rounds: int = 0
     dagger_frames: int = 6000
+    inputs: str | None = None
+    episodes: int | None = None
+    keypoint_weight: float = 1.0
+    error_scale: float | None = None
     workers: int = 2
     seed: int = 0
 
@@ -58,6 +68,10 @@ class Pretrain:
                 steps=self.steps,
                 dagger_rounds=self.dagger_rounds,
                 dagger_frames=self.dagger_frames,
+                inputs=None if self.inputs is None else tuple(self.inputs.split("+")),
+                episodes=self.episodes,
+                keypoint_weight=self.keypoint_weight,
+                error_scale=self.error_scale,
                 workers=self.workers,
                 seed=self.seed,
                 on_progress=lambda state: update(state.stage, state.share, _words(state)),

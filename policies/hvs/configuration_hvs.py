@@ -1,12 +1,19 @@
 """Configuration of the `hvs` policy."""
 
+import math
 from dataclasses import dataclass, field
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 from lerobot.utils.constants import OBS_STATE
 
-from hvs_suite.policies.hvs.network import IMAGE_PREFIX, N_JOINTS, POSITIONS_AND_VELOCITIES, Shape
+from hvs_suite.policies.hvs.network import (
+    ERROR_SCALE,
+    IMAGE_PREFIX,
+    N_JOINTS,
+    POSITIONS_AND_VELOCITIES,
+    Shape,
+)
 
 CAMERAS = ("eih", "eth")
 
@@ -24,6 +31,8 @@ class HvsConfig(PreTrainedConfig):
         normalization_mapping: All identity: the network scales images and joints itself.
         channels: Channels of the image encoders.
         hidden: Width of the perceptron that decides.
+        error_scale: Below this, errors weigh linearly, above logarithmically: of a joint's step
+            (rad) and of a place (m). Some five times the tolerance that is aimed at.
         keypoint_weight: Weight of the losses against the projected target and its place in space,
             where the dataset has ``privileged.*`` columns; 0 trains on actions alone.
         optimizer_lr: Peak learning rate of stock ``lerobot-train``.
@@ -39,6 +48,7 @@ class HvsConfig(PreTrainedConfig):
     )
     channels: int = 32
     hidden: int = 256
+    error_scale: float = ERROR_SCALE
     keypoint_weight: float = 1.0
     optimizer_lr: float = 2e-3
     optimizer_weight_decay: float = 1e-4
@@ -51,6 +61,8 @@ class HvsConfig(PreTrainedConfig):
                 f"`channels` and `hidden` must be at least 4, got {self.channels} and "
                 f"{self.hidden}."
             )
+        if not 0 < self.error_scale < math.inf:
+            raise ValueError(f"`error_scale` must be above 0, got {self.error_scale}.")
         if self.keypoint_weight < 0:
             raise ValueError(f"`keypoint_weight` must not be negative, got {self.keypoint_weight}.")
         if self.n_obs_steps != 1:
@@ -86,7 +98,13 @@ class HvsConfig(PreTrainedConfig):
             for key, feature in sorted(self.image_features.items())
         }
         state = self.robot_state_feature
-        return Shape(cameras, state.shape[0] if state else 0, self.channels, self.hidden)
+        return Shape(
+            cameras,
+            state.shape[0] if state else 0,
+            self.channels,
+            self.hidden,
+            self.error_scale,
+        )
 
     def get_optimizer_preset(self) -> AdamWConfig:
         """AdamW with this configuration's rate and decay."""

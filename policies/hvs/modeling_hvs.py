@@ -96,7 +96,7 @@ class HvsPolicy(PreTrainedPolicy):
                 supervised = True
         if weight > 0 and target is not None and GOAL_POSITION in batch and GOAL_NORMAL in batch:
             truth = batch[GOAL_POSITION] - self.network.standoff * batch[GOAL_NORMAL]
-            part = target_loss(target, truth)
+            part = target_loss(target, truth, self.config.error_scale)
             parts["target_loss"] = part.detach()
             loss = loss + 0.1 * weight * part
         if self.training and weight > 0 and not supervised and not self._warned:

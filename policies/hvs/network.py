@@ -34,9 +34,9 @@ FEATURE_SIZE = 28
 OUTLINE_SIZE = 7
 """Cells along the side of the coarse picture of a disc's outline."""
 SIGHTING_FEATURES = 5
-DELTA_SCALE_RAD = 0.005
-"""Joint steps are regressed as asinh(step / this): linear below, logarithmic above."""
-OFFSET_SCALE_M = 0.005
+ERROR_SCALE = 0.005
+"""Joint steps (rad) and offsets (m) are read and learned as asinh(x / this): linear below,
+logarithmic above. The default suits a tolerance of a millimetre."""
 POSITIONS_AND_VELOCITIES = 2 * N_JOINTS
 SEEN_LOGIT = 2.0
 """How sure an eye must be (as a logit) that it sees the target before its place is remembered."""
@@ -52,12 +52,14 @@ class Shape:
         state_dim: 14 for joint positions and velocities, 7 for positions alone, 0 for neither.
         channels: Channels of the encoders.
         hidden: Width of the perceptron.
+        error_scale: See `ERROR_SCALE`; decides what the weights mean.
     """
 
     cameras: Mapping[str, tuple[int, int]]
     state_dim: int
     channels: int
     hidden: int
+    error_scale: float = ERROR_SCALE
 
 
 def shape_from_config(config: Mapping[str, Any]) -> Shape:
@@ -79,7 +81,13 @@ def shape_from_config(config: Mapping[str, Any]) -> Shape:
         if key.startswith(IMAGE_PREFIX)
     }
     state_dim = int(features[STATE]["shape"][0]) if STATE in features else 0
-    return Shape(cameras, state_dim, int(config["channels"]), int(config["hidden"]))
+    return Shape(
+        cameras,
+        state_dim,
+        int(config["channels"]),
+        int(config["hidden"]),
+        float(config["error_scale"]),
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -325,11 +333,10 @@ class HvsNetwork(nn.Module):
             memory = state.new_zeros(len(state), MEMORY_SIZE)
         motion = geometry.flange_motion(q)
         target, estimates, remembered = self._place(motion, sightings, memory)
+        scale = self.shape.error_scale
         lift = torch.zeros_like(target)
         lift[:, 2] = self.standoff
-        step = torch.asinh(
-            geometry.joint_step(motion, target + lift - motion.position) / DELTA_SCALE_RAD
-        )
+        step = torch.asinh(geometry.joint_step(motion, target + lift - motion.position) / scale)
         features += [torch.sin(q), torch.cos(q), q / self.joint_range]
         features += [motion.position, motion.rotation.flatten(1), step]
         if self.shape.state_dim == POSITIONS_AND_VELOCITIES:
@@ -337,7 +344,7 @@ class HvsNetwork(nn.Module):
         for estimate in estimates:
             offset = estimate[:, :3] + lift - motion.position
             in_flange = (offset[:, None] @ motion.rotation)[:, 0]
-            features += [offset, torch.asinh(in_flange / OFFSET_SCALE_M), estimate[:, 3:]]
+            features += [offset, torch.asinh(in_flange / scale), estimate[:, 3:]]
         out = self.head(torch.cat(features, dim=1)) + self.step_gain * step
         return Decision(out, sightings, target, remembered)
 
@@ -392,7 +399,10 @@ class HvsNetwork(nn.Module):
         """
         if state is None:
             return out.clamp(-1.0, 1.0)
-        target = state[:, :N_JOINTS] + DELTA_SCALE_RAD * torch.sinh(out.clamp(-8.0, 8.0))
+        # A step of more than a radian helps no control period.
+        bound = math.asinh(1.0 / self.shape.error_scale)
+        step = self.shape.error_scale * torch.sinh(out.clamp(-bound, bound))
+        target = state[:, :N_JOINTS] + step
         return (target / self.joint_range).clamp(-1.0, 1.0)
 
     def encode_label(self, action: Tensor, state: Tensor | None) -> Tensor:
@@ -408,7 +418,7 @@ class HvsNetwork(nn.Module):
         if state is None:
             return action
         step = action * self.joint_range - state[:, :N_JOINTS]
-        return torch.asinh(step / DELTA_SCALE_RAD)
+        return torch.asinh(step / self.shape.error_scale)
 
 
 def action_loss(out: Tensor, label: Tensor) -> Tensor:
@@ -416,9 +426,9 @@ def action_loss(out: Tensor, label: Tensor) -> Tensor:
     return F.smooth_l1_loss(out, label, beta=0.3)
 
 
-def target_loss(target: Tensor, truth: Tensor) -> Tensor:
-    """Loss of the target's place in space, logarithmic beyond `OFFSET_SCALE_M`, both (B, 3) m."""
-    return torch.asinh((target - truth).abs() / OFFSET_SCALE_M).mean()
+def target_loss(target: Tensor, truth: Tensor, error_scale: float) -> Tensor:
+    """Loss of the target's place in space, logarithmic beyond the scale, both (B, 3) m."""
+    return torch.asinh((target - truth).abs() / error_scale).mean()
 
 
 def sighting_loss(sighting: Sighting, truth: Tensor) -> Tensor:

@@ -83,7 +83,7 @@ def test_frames_come_back_from_the_cache_as_they_were_recorded(dataset, tmp_path
     for _ in range(2):  # decoded, then opened again
         decoded = []
         demonstrations = Demonstrations(
-            read_manifest(dataset), tmp_path / "cache", 0, decoded.append
+            read_manifest(dataset), tmp_path / "cache", 0, on_frames=decoded.append
         )
         batch = demonstrations.batch(np.array([7, 31]))
         for camera in ("eih", "eth"):
@@ -100,6 +100,29 @@ def test_held_out_frames_are_whole_episodes_that_training_never_sees(dataset, tm
     assert held_out
     assert held_out.isdisjoint(set(demonstrations.training // 4))
     assert len(demonstrations.held_out) + len(demonstrations.training) == 40
+
+
+def test_of_few_demonstrations_only_those_are_seen(dataset, tmp_path):
+    demonstrations = Demonstrations(read_manifest(dataset), tmp_path, seed=0, episodes=3)
+    seen = np.concatenate([demonstrations.held_out, demonstrations.training])
+    assert sorted(seen) == list(range(12))
+
+
+@pytest.mark.parametrize("inputs", [("eih", "joints"), ("eth",), ("eih", "eth")])
+def test_a_policy_of_fewer_inputs_has_no_more(dataset, tmp_path, inputs):
+    pretrain(dataset, tmp_path / "out", steps=2, batch_size=4, inputs=inputs)
+    config = json.loads((tmp_path / "out/config.json").read_text())
+    names = {"observation.state": "joints"}
+    found = {names.get(key, key.rpartition(".")[2]) for key in config["input_features"]}
+    assert found == set(inputs)
+
+
+def test_errors_weigh_by_the_tolerance_unless_told_otherwise(dataset, tmp_path):
+    scales = []
+    for name, options in (("a", {}), ("b", {"error_scale": 0.5})):
+        pretrain(dataset, tmp_path / name, steps=1, batch_size=4, **options)
+        scales.append(json.loads((tmp_path / name / "config.json").read_text())["error_scale"])
+    assert scales == [0.025, 0.5]
 
 
 def test_data_recorded_on_the_test_split_is_refused(tmp_path):
@@ -144,6 +167,11 @@ def test_a_run_with_other_settings_is_not_mixed_into(dataset, tmp_path):
         {"minutes": math.nan},
         {"steps": 1, "batch_size": 0},
         {"steps": 1, "learning_rate": 0.0},
+        {"steps": 1, "episodes": 11},
+        {"steps": 1, "keypoint_weight": -1.0},
+        {"steps": 1, "error_scale": 0.0},
+        {"steps": 1, "inputs": ("eih", "nose")},
+        {"steps": 1, "inputs": ("joints",)},
     ],
 )
 def test_numbers_that_make_no_sense_are_refused(dataset, tmp_path, options):

@@ -1,0 +1,192 @@
+"""What a training run is a function of, and the fresh policy and the folder that it starts with."""
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from hvs_suite.errors import OptionError, OutputError
+from hvs_suite.files import check_writable, replacing
+from hvs_suite.policies.demonstrations import Manifest, calibration_of
+from hvs_suite.policies.hvs.network import IMAGE_PREFIX, STATE, Eye
+from hvs_suite.registry import find
+from hvs_suite.tasks.variants import with_options
+
+if TYPE_CHECKING:
+    from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
+
+PACKAGES = ("hvs-suite", "lerobot", "numpy", "torch")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings:
+    """All that decides what a run learns, the budget aside.
+
+    Attributes:
+        seed: Of initial weights, held-out episodes and order.
+        batch_size: Frames a step.
+        learning_rate: Peak of the schedule.
+        dagger_rounds: Rounds of DAgger.
+        dagger_frames: Frames a round.
+        dataset: Fingerprint of the dataset.
+        task: Named task that it was recorded on.
+        inputs: What the policy is given; None for all.
+        episodes: Learn from the first so many demonstrations alone; None from all.
+        keypoint_weight: Of the policy.
+        error_scale: Of the policy.
+    """
+
+    seed: int
+    batch_size: int
+    learning_rate: float
+    dagger_rounds: int
+    dagger_frames: int
+    dataset: str
+    task: str
+    inputs: tuple[str, ...] | None
+    episodes: int | None
+    keypoint_weight: float
+    error_scale: float
+
+    def check(self, manifest: Manifest) -> None:
+        """Refuse numbers that make no sense.
+
+        Args:
+            manifest: Of the dataset.
+
+        Raises:
+            OptionError: There is one.
+        """
+        for name in ("batch_size", "dagger_frames"):
+            if getattr(self, name) < 1:
+                raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if not 0.0 < self.learning_rate < 1.0:
+            raise OptionError(f"learning_rate must be between 0 and 1, not {self.learning_rate}")
+        if self.dagger_rounds < 0:
+            raise OptionError(f"dagger_rounds must be 0 or more, not {self.dagger_rounds}")
+        if self.episodes is not None and not 1 <= self.episodes <= manifest.n_episodes:
+            raise OptionError(
+                f"episodes must be 1 to the dataset's {manifest.n_episodes}, not {self.episodes}"
+            )
+        if not 0.0 <= self.keypoint_weight < math.inf:
+            raise OptionError(f"keypoint_weight must be 0 or more, not {self.keypoint_weight}")
+        if not 0.0 < self.error_scale < math.inf:
+            raise OptionError(f"error_scale must be above 0, not {self.error_scale}")
+
+
+def tightest_scale(manifest: Manifest) -> float:
+    """Five times the tightest tolerance of a dataset's task (m), see `HvsConfig.error_scale`.
+
+    Args:
+        manifest: Of the dataset.
+    """
+    task = with_options(find(manifest.task), manifest.options)
+    tolerances = (task.position_tolerance_mm, task.lateral_tolerance_mm, task.height_tolerance_mm)
+    return 5e-3 * min(tolerance for tolerance in tolerances if tolerance is not None)
+
+
+def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":
+    """A fresh policy for a dataset's inputs, its cameras calibrated from the dataset.
+
+    Args:
+        manifest: Of the dataset, with the inputs that the policy is to have.
+        settings: Of the run.
+    """
+    from lerobot.configs import FeatureType, PolicyFeature
+
+    from hvs_suite.policies.hvs.configuration_hvs import HvsConfig
+    from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
+
+    inputs = {
+        IMAGE_PREFIX + name: PolicyFeature(FeatureType.VISUAL, (shape[2], shape[0], shape[1]))
+        for name, shape in manifest.cameras.items()
+    }
+    if STATE in manifest.features:
+        shape = tuple(manifest.features[STATE]["shape"])
+        inputs[STATE] = PolicyFeature(FeatureType.STATE, shape)
+    config = HvsConfig(
+        input_features=inputs,
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},
+        device="cpu",
+        push_to_hub=False,
+        optimizer_lr=settings.learning_rate,
+        keypoint_weight=settings.keypoint_weight,
+        error_scale=settings.error_scale,
+    )
+    # torch initialises weights from its global generator; leave that as it was found.
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.seed)
+        policy = HvsPolicy(config)
+    if STATE in manifest.features:
+        policy.network.set_calibration(calibration_of(manifest.root))
+    for module in policy.modules():
+        if isinstance(module, Eye):
+            module.train_in_bfloat16 = torch.cpu._is_avx512_bf16_supported()
+    return policy
+
+
+def claim(out: Path, settings: Settings) -> None:
+    """Take the folder, or recognise it as an interrupted run with the same settings.
+
+    Args:
+        out: The run's folder.
+        settings: Of the run.
+
+    Raises:
+        OutputError: It cannot be written, or holds something else.
+    """
+    config = out / "train_config.json"
+    check_writable(config)
+    try:
+        begun = json.loads(config.read_text())["settings"]
+    except OSError:
+        if any(out.iterdir()):
+            raise OutputError(f"{out} is not empty; name another --out") from None
+        return
+    except (ValueError, KeyError, TypeError):
+        raise OutputError(f"{config} is damaged; name another --out") from None
+    wanted = json.loads(json.dumps(dataclasses.asdict(settings)))
+    differing = sorted(k for k in wanted if begun.get(k) != wanted[k])
+    if differing:
+        raise OutputError(
+            f"{out} holds a run with another {', '.join(differing)}; name another --out"
+        )
+
+
+def write_config(
+    out: Path,
+    data: Path,
+    settings: Settings,
+    budget: Mapping[str, float | None],
+    policy: "HvsPolicy",
+) -> None:
+    """Write ``train_config.json``, from which the run can be repeated.
+
+    Args:
+        out: The run's folder.
+        data: Root of the dataset.
+        settings: Of the run.
+        budget: ``minutes`` and ``steps``.
+        policy: Its sizes are noted.
+    """
+    content = {
+        "format": 1,
+        "data": str(data),
+        "settings": dataclasses.asdict(settings),
+        "budget": budget,
+        "policy": {
+            "type": "hvs",
+            "channels": policy.config.channels,
+            "hidden": policy.config.hidden,
+            "weight_decay": policy.config.optimizer_weight_decay,
+        },
+        "versions": {name: version(name) for name in PACKAGES},
+        "threads": torch.get_num_threads(),
+    }
+    with replacing(out / "train_config.json") as temporary:
+        temporary.write_text(json.dumps(content, indent=2) + "\n")

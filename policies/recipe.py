@@ -1,0 +1,64 @@
+"""How the shipped weights were made: for each named task, the commands that make them again.
+
+``recipes/<task>.json`` holds the training command of a policy, the dataset's recipe in the room of
+the datasets the recording command. Tasks that differ in tolerance alone share a policy.
+"""
+
+import dataclasses
+import json
+import shlex
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+
+from hvs_suite import registry
+
+HERE = Path(__file__).resolve().parent
+DATASET_RECIPES = HERE.parent / "datasets" / "recipes"
+
+SHARED: Mapping[str, str] = MappingProxyType(
+    {"align-fixed": "align-thesis", "align-easy": "align-thesis"}
+)
+"""Tasks that the policy of another task plays: the same scenes, wider tolerances."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Recipe:
+    """Two commands.
+
+    Attributes:
+        task: Named task whose policy this is.
+        record: Words after ``hvs`` that record the demonstrations.
+        pretrain: Words after ``hvs`` that train on them.
+    """
+
+    task: str
+    record: tuple[str, ...]
+    pretrain: tuple[str, ...]
+
+
+def trained_on(task: str) -> str:
+    """The named task that a task's shipped policy was trained on.
+
+    Args:
+        task: Named task.
+    """
+    return SHARED.get(task, task)
+
+
+def recipe(task: str) -> Recipe:
+    """How the policy of a task was made.
+
+    Args:
+        task: Named task.
+
+    Raises:
+        UnknownTaskError: There is no such task.
+    """
+    registry.find(task)
+    name = trained_on(task)
+    record, pretrain = (
+        tuple(shlex.split(json.loads((folder / f"{name}.json").read_text())["command"])[1:])
+        for folder in (DATASET_RECIPES, HERE / "recipes")
+    )
+    return Recipe(name, record, pretrain)

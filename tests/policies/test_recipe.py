@@ -1,0 +1,33 @@
+"""How shipped weights are made: every named task's commands are there, and ``hvs`` takes them."""
+
+import pytest
+
+import hvs_suite
+from hvs_suite.cli.main import parse, run
+from hvs_suite.policies.recipe import recipe, trained_on
+
+
+@pytest.mark.parametrize("task", sorted(hvs_suite.TASKS))
+def test_a_recipe_trains_on_what_it_records(task):
+    plan = recipe(task)
+    record, pretrain = parse(plan.record), parse(plan.pretrain)
+    assert record.task == plan.task == trained_on(task)
+    assert pretrain.data == record.out
+    assert pretrain.steps
+
+
+@pytest.mark.parametrize("task", sorted(hvs_suite.TASKS))
+def test_a_shared_policy_sees_what_its_own_task_shows(task):
+    one, other = hvs_suite.TASKS[task], hvs_suite.TASKS[trained_on(task)]
+    for name in ("eih_resolution", "eth_resolution", "observations", "target_diameter_m"):
+        assert getattr(one, name) == getattr(other, name)
+
+
+@pytest.mark.parametrize(
+    "words", [["--task", "align-nothing"], ["--task", "align-easy", "--episodes", "0"]]
+)
+def test_nonsense_is_one_line(words, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run(["reproduce", *words]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
