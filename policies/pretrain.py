@@ -35,6 +35,7 @@ from hvs_suite.policies.pretrain_settings import (
     tightest_scale,
     write_config,
 )
+from hvs_suite.policies.training_plot import draw_run
 from hvs_suite.policies.training_state import Counters, load_state, save_state
 
 if TYPE_CHECKING:
@@ -191,6 +192,7 @@ def pretrain(
     outcome = run.outcome(policy)
     with replacing(training / "outcome.json") as temporary:
         temporary.write_text(json.dumps(dataclasses.asdict(outcome), indent=2) + "\n")
+    draw_run(out)
     return outcome
 
 

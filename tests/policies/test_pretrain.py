@@ -8,6 +8,7 @@ from pathlib import Path
 import miniature
 import numpy as np
 import pytest
+from PIL import Image
 from safetensors.torch import load_file
 
 from hvs_suite.errors import DatasetError, OptionError, OutputError
@@ -45,6 +46,8 @@ def test_training_lowers_the_loss_and_reports_it(dataset, tmp_path):
     assert math.isfinite(outcome.held_out_loss)
     assert json.loads((tmp_path / "out/training/outcome.json").read_text())["step"] == 40
     assert list((tmp_path / "out/training/tensorboard").iterdir())
+    with Image.open(tmp_path / "out/training/training.png") as picture:
+        assert len(picture.convert("RGB").getcolors(1 << 20)) > 50
 
 
 def test_a_killed_run_ends_like_one_that_was_left_alone(dataset, tmp_path):

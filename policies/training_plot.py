@@ -1,0 +1,105 @@
+"""A picture of a training run: its losses, and how its DAgger rounds went."""
+
+import json
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hvs_suite.files import replacing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+PICTURE = "training.png"
+# Means over so many logged points (of 20 steps each), so that a line shows and not a cloud.
+SMOOTHED_POINTS = 10
+PARTS = {
+    "action_loss": "action",
+    "eih_loss": "eye in hand",
+    "eth_loss": "eye to hand",
+    "target_loss": "place of the target",
+}
+Curve = tuple[Any, Any]
+
+
+def draw_run(out: Path) -> Path:
+    """Draw a run that `pretrain` left.
+
+    Args:
+        out: The run's folder; TensorBoard's files and the rounds lie in ``out/training``.
+
+    Returns:
+        The picture, ``out/training/training.png``.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    curves = _curves(out / "training" / "tensorboard")
+    rounds = _rounds(out / "training" / "dagger")
+    figure = Figure(figsize=(11.0, 3.6), layout="constrained")
+    whole, parts, played = figure.subplots(1, 3)
+    _draw(whole, curves, {"train/loss": "training", "held_out/loss": "held out"})
+    _draw(parts, curves, {f"train/{key}": name for key, name in PARTS.items()})
+    whole.set_title("loss")
+    parts.set_title("its parts, in training")
+    for axes in (whole, parts):
+        axes.set(xlabel="optimiser step", yscale="log")
+        axes.grid(alpha=0.3)
+        axes.legend(frameon=False, fontsize=8)
+    _draw_rounds(played, rounds)
+    target = out / "training" / PICTURE
+    with replacing(target) as temporary:
+        figure.savefig(temporary, format="png", dpi=110)
+    return target
+
+
+def _curves(folder: Path) -> dict[str, Curve]:
+    """Every scalar that TensorBoard holds: name to steps (n,) and values (n,)."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    # A resumed run has a file a sitting, which is no cause for alarm.
+    logging.getLogger("tensorboard").setLevel(logging.ERROR)
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
+    events.Reload()
+    return {
+        name: (
+            np.array([event.step for event in events.Scalars(name)]),
+            np.array([event.value for event in events.Scalars(name)]),
+        )
+        for name in events.Tags()["scalars"]
+    }
+
+
+def _rounds(folder: Path) -> list[dict[str, Any]]:
+    """What the rounds came to, in order."""
+    paths = sorted(folder.glob("round-*/round.json"), key=lambda p: int(p.parent.name[6:]))
+    return [json.loads(path.read_text()) for path in paths]
+
+
+def _draw(axes: "Axes", curves: dict[str, Curve], names: dict[str, str]) -> None:
+    for key, name in names.items():
+        if key not in curves:
+            continue
+        steps, values = curves[key]
+        if key.startswith("train/") and len(values) >= SMOOTHED_POINTS:
+            weights = np.full(SMOOTHED_POINTS, 1.0 / SMOOTHED_POINTS)
+            values = np.convolve(values, weights, mode="valid")
+            steps = steps[SMOOTHED_POINTS - 1 :]
+        axes.plot(steps, values, label=name, linewidth=1.2)
+
+
+def _draw_rounds(axes: "Axes", rounds: list[dict[str, Any]]) -> None:
+    axes.set_title("DAgger rounds: episodes solved")
+    if not rounds:
+        axes.text(0.5, 0.5, "none", ha="center", va="center", transform=axes.transAxes)
+        axes.set_axis_off()
+        return
+    numbers = np.arange(1, len(rounds) + 1)
+    shares = [100.0 * r["successes"] / r["episodes"] for r in rounds]
+    bars = axes.bar(numbers, shares, color="tab:green")
+    axes.bar_label(bars, [f"{share:.0f} %" for share in shares], fontsize=8)
+    axes.set(xlabel="round", ylabel="solved (%)", ylim=(0.0, 110.0), xticks=numbers)
