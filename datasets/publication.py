@@ -65,18 +65,31 @@ def push(root: Path, repository: str, card: str, licence: str, *, private: bool)
         ServerError: The Hub cannot be reached or refuses.
     """
     check_repository(repository)
+    dataset = _open(root, repository)
+    with hub_errors(repository), _quiet():
+        dataset.push_to_hub(
+            license=licence,
+            tags=[*TAGS[1:], read_metadata(root).task],
+            private=private,
+            dataset_description=card,
+        )
+
+
+@contextlib.contextmanager
+def hub_errors(repository: str) -> Iterator[None]:
+    """Turns what goes wrong while something is pushed to the Hub into one typed line.
+
+    Args:
+        repository: ``user/name``.
+
+    Raises:
+        ServerError: The Hub cannot be reached or refuses.
+    """
     import httpx
     from huggingface_hub.errors import HfHubHTTPError, LocalTokenNotFoundError
 
-    dataset = _open(root, repository)
     try:
-        with _quiet():
-            dataset.push_to_hub(
-                license=licence,
-                tags=[*TAGS[1:], read_metadata(root).task],
-                private=private,
-                dataset_description=card,
-            )
+        yield
     except LocalTokenNotFoundError:
         raise ServerError(
             "no access token for the Hub; set HF_TOKEN, or run 'hf auth login'"

@@ -1,4 +1,4 @@
-"""Fetches checkpoints from the Hugging Face Hub: ``owner/name``, or ``owner/name@revision``.
+"""Checkpoints on the Hugging Face Hub: ``owner/name``, or ``owner/name@revision``.
 
 The Hub's own client does the work: it keeps what it fetched, works offline from there
 (``HF_HUB_OFFLINE=1``), and lets ``HF_ENDPOINT`` name another server. Only settings and weights are
@@ -8,6 +8,7 @@ fetched; neither can hold code.
 import contextlib
 import functools
 import re
+from collections.abc import Collection
 from pathlib import Path
 
 from hvs_suite.errors import PolicyError
@@ -52,3 +53,32 @@ def fetch(spec: str) -> Path:
             f"{spec!r} is no folder here and was never fetched, and the Hub cannot be reached; "
             "check the name, go online, or name a checkpoint folder"
         ) from error
+
+
+def push(folder: Path, repository: str, files: Collection[str], *, private: bool) -> None:
+    """Push files of a checkpoint to the Hub, whose client finds the token by itself.
+
+    Args:
+        folder: The checkpoint.
+        repository: ``user/name``; made if it is not there.
+        files: What to push, relative to the folder.
+        private: Make the repository private.
+
+    Raises:
+        OptionError: The repository's name is malformed.
+        ServerError: The Hub cannot be reached or refuses.
+    """
+    from huggingface_hub import HfApi
+
+    from hvs_suite.datasets.publication import check_repository, hub_errors
+
+    check_repository(repository)
+    with hub_errors(repository):
+        api = HfApi()
+        api.create_repo(repository, private=private, exist_ok=True)
+        api.upload_folder(
+            repo_id=repository,
+            folder_path=folder,
+            allow_patterns=list(files),
+            commit_message="Upload policy",
+        )

@@ -49,7 +49,8 @@ def draw_run(out: Path) -> Path:
     for axes in (whole, parts):
         axes.set(xlabel="optimiser step", yscale="log")
         axes.grid(alpha=0.3)
-        axes.legend(frameon=False, fontsize=8)
+        if axes.lines:
+            axes.legend(frameon=False, fontsize=8)
     _draw_rounds(played, rounds)
     target = out / "training" / PICTURE
     with replacing(target) as temporary:

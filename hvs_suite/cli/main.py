@@ -29,6 +29,8 @@ COMMANDS = {
     "share": "hvs_suite.cli.share:Share",
     "fetch": "hvs_suite.cli.fetch:Fetch",
     "pretrain": "hvs_suite.cli.pretrain:Pretrain",
+    "train-sac": "hvs_suite.cli.train_sac:TrainSac",
+    "ship": "hvs_suite.cli.ship:Ship",
     "evaluate": "hvs_suite.cli.evaluate:Evaluate",
     "serve": "hvs_suite.cli.serve:Serve",
     "verify": "hvs_suite.cli.verify:Verify",

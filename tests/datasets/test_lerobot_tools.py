@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from frames import columns
-from hub import running_hub
+from hub_server import running_hub
 
 from hvs_suite.cli.main import run
 from hvs_suite.datasets.archive import unpack

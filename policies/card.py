@@ -1,0 +1,174 @@
+"""The model card: what a checkpoint of ours is, how it was made, and how well it does.
+
+``README.md`` with the front matter that the Hub reads, written into the checkpoint's folder beside
+the picture of its training.
+"""
+
+import json
+import shutil
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from hvs_suite.errors import PolicyError
+from hvs_suite.files import replacing
+from hvs_suite.policies.training_plot import PICTURE
+
+CARD = "README.md"
+LICENCE = "apache-2.0"
+CHECKPOINT_FILES = (
+    "config.json",
+    "model.safetensors",
+    "policy_preprocessor.json",
+    "policy_postprocessor.json",
+)
+TRAINING_FILES = ("train_config.json", "training/outcome.json", f"training/{PICTURE}")
+
+
+def write_card(folder: Path, results: Iterable[Mapping[str, Any]] = (), command: str = "") -> str:
+    """Write a checkpoint's card.
+
+    Args:
+        folder: The checkpoint, as `pretrain` leaves it.
+        results: Result files of `hvs evaluate`, parsed, that speak of these weights.
+        command: That made the checkpoint; empty if it is not known.
+
+    Returns:
+        The card's text without its front matter.
+
+    Raises:
+        PolicyError: The folder holds no checkpoint of `pretrain`.
+        OutputError: It cannot be written.
+    """
+    config, trained, outcome = (
+        _read(folder / name) for name in ("config.json", *TRAINING_FILES[:2])
+    )
+    body = describe(config, trained, outcome, list(results), command)
+    task = trained["settings"]["task"]
+    with replacing(folder / CARD) as temporary:
+        temporary.write_text(_front_matter(task) + body, encoding="utf-8")
+    return body
+
+
+def ship(checkpoint: Path, folder: Path) -> None:
+    """Copy what others need of a training run: weights, settings and how it went.
+
+    Args:
+        checkpoint: The run's folder.
+        folder: Gets the files; those of the same names are replaced.
+
+    Raises:
+        PolicyError: The run is not finished.
+        OutputError: The folder cannot be written.
+    """
+    for name in (*CHECKPOINT_FILES, *TRAINING_FILES):
+        if not (checkpoint / name).is_file():
+            raise PolicyError(f"{checkpoint} lacks {name}; let hvs pretrain come to its end first")
+    for name in (*CHECKPOINT_FILES, *TRAINING_FILES):
+        with replacing(folder / name) as temporary:
+            shutil.copyfile(checkpoint / name, temporary)
+
+
+def describe(
+    config: Mapping[str, Any],
+    trained: Mapping[str, Any],
+    outcome: Mapping[str, Any],
+    results: list[Mapping[str, Any]],
+    command: str,
+) -> str:
+    """The card's text, Markdown.
+
+    Args:
+        config: The checkpoint's ``config.json``.
+        trained: Its ``train_config.json``.
+        outcome: Its ``training/outcome.json``.
+        results: As in `write_card`.
+        command: As in `write_card`.
+    """
+    settings = trained["settings"]
+    inputs = ", ".join(
+        f"`{key}` {' x '.join(map(str, value['shape']))}"
+        for key, value in sorted(config["input_features"].items())
+    )
+    rounds = outcome["rounds"]
+    corrected = sum(played["frames"] for played in rounds)
+    hours = (outcome["train_s"] + outcome["play_s"]) / 3600.0
+    rows = {
+        "trained on": f"`{settings['task']}`, split `train` alone",
+        "inputs": inputs,
+        "output": "`action` 7: joint position targets in units of the joint range",
+        "parameters": f"{outcome['n_parameters']:,}",
+        "demonstrations": "of the suite's expert; in a starting half of them near the goal",
+        "DAgger": f"{len(rounds)} rounds, {corrected:,} frames played by the policy itself under "
+        "the expert's labels"
+        if rounds
+        else "none",
+        "optimiser steps": f"{outcome['step']:,} of {settings['batch_size']} frames",
+        "time": f"{hours:.2f} h on two cores, recording not counted",
+        "supervision in training": "the expert's action, and where the target is "
+        "(`privileged.*`); neither is an input"
+        if settings["keypoint_weight"] > 0
+        else "the expert's action",
+        "seed": str(settings["seed"]),
+        "licence": LICENCE,
+    }
+    lines = [
+        f"# hvs policy for {settings['task']}",
+        "",
+        "Two camera images and the joints in, seven joint position targets out: a LeRobot policy "
+        "of type `hvs` that brings the flange of a simulated KUKA LBR iiwa 7 over a disc.",
+        "",
+        f"![Losses and rounds of the training](training/{PICTURE})",
+        "",
+        "| | |",
+        "|---|---|",
+        *(f"| {name} | {value} |" for name, value in rows.items()),
+        "",
+        *_results(results),
+    ]
+    if command:
+        lines += ["Made by:", "", "```sh", command, "```", ""]
+    lines += [
+        "Limits: it knows this cell alone (the robot, the cameras' nominal places, one disc on a "
+        "level surface) and was never on a real robot. Outside of the ring of targets that the "
+        "task draws from, anything may happen.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _results(results: list[Mapping[str, Any]]) -> list[str]:
+    """A table of scores, or that there are none."""
+    if not results:
+        return ["Not scored yet: see `hvs evaluate`.", ""]
+    lines = [
+        "| task | split | solved | 95 % interval | collisions | steps | settled error, mm |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for result in sorted(results, key=lambda each: str(each["summary"]["task"])):
+        summary = result["summary"]
+        low, high = summary["pc_success_ci95"]
+        steps = summary["steps_to_goal_mean"]
+        lines.append(
+            f"| `{summary['task']}` | `{summary['split']}` | {summary['n_success']:,} of "
+            f"{summary['n_episodes']:,} ({summary['pc_success']:.1f} %) | {low:.1f} to {high:.1f} "
+            f"% | {summary['n_collision']} | {'-' if steps is None else f'{steps:.1f}'} | "
+            f"{summary['settled_position_error_mm']['iqm']:.3f} |"
+        )
+    return [*lines, ""]
+
+
+def _front_matter(task: str) -> str:
+    """The YAML that the Hub reads."""
+    tags = ("LeRobot", "robotics", "visual-servoing", "kuka-lbr-iiwa", "hvs-suite", task)
+    lines = ["---", f"license: {LICENCE}", "library_name: lerobot", "pipeline_tag: robotics"]
+    return "\n".join([*lines, "tags:", *(f"- {tag}" for tag in tags), "---", "", ""])
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError) as error:
+        raise PolicyError(
+            f"{path.parent} holds no finished run of hvs pretrain: no readable {path.name}"
+        ) from error
