@@ -25,8 +25,6 @@ TAGS = ("LeRobot", "robotics", "visual-servoing", "kuka-lbr-iiwa", "hvs-suite")
 
 _TILE_PX = 160
 _COLUMNS = 6
-_GAP_PX = 6
-_TITLE_PX = 20
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,31 +183,19 @@ def draw_pictures(root: Path, info: dict[str, Any]) -> Any:
     Raises:
         DatasetError: They cannot be read.
     """
-    from PIL import Image, ImageDraw
-
-    from hvs_suite.pictures import FAINT, INK, PAPER, font, resize
+    from hvs_suite.pictures import resize, strip
 
     place = min(reader.read_places(root), key=lambda each: each.episode)
     table = reader.read_episode(root, place)
     titles = {"eih": "eye in hand", "eth": "eye to hand"}
     cameras = [camera for camera in titles if image_key(camera) in info["features"]]
     steps = np.unique(np.linspace(0, place.length - 1, _COLUMNS).round().astype(int))
-    pitch = _TILE_PX + _GAP_PX
-    size = (_GAP_PX + len(steps) * pitch, _GAP_PX + len(cameras) * (pitch + _TITLE_PX))
-    sheet = Image.new("RGB", size, PAPER)
-    draw = ImageDraw.Draw(sheet)
-    for row, camera in enumerate(cameras):
-        pictures = reader.read_pictures(root, place, table, image_key(camera), int(info["fps"]))
-        y = _GAP_PX + row * (pitch + _TITLE_PX)
-        draw.text((_GAP_PX, y), titles[camera], INK, font(13, bold=True))
-        for column, step in enumerate(steps):
-            x = _GAP_PX + column * pitch
-            sheet.paste(Image.fromarray(resize(pictures[step], _TILE_PX)), (x, y + _TITLE_PX))
-            # The first column's title stands where its time would.
-            if column:
-                time = f"{step / float(info['fps']):.1f} s"
-                draw.text((x + _TILE_PX, y + 1), time, FAINT, font(12), anchor="ra")
-    return sheet
+    fps = int(info["fps"])
+    rows = {}
+    for camera in cameras:
+        pictures = reader.read_pictures(root, place, table, image_key(camera), fps)
+        rows[titles[camera]] = [resize(pictures[step], _TILE_PX) for step in steps]
+    return strip(rows, [step / fps for step in steps])
 
 
 def _front_matter(metadata: DatasetMetadata, licence: str) -> str:

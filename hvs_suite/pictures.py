@@ -18,6 +18,7 @@ from hvs_suite.files import replacing
 from hvs_suite.rollout import run_episode
 
 if TYPE_CHECKING:
+    from PIL.Image import Image
     from PIL.ImageDraw import ImageDraw
     from PIL.ImageFont import FreeTypeFont
 
@@ -36,6 +37,9 @@ MARGIN = 16
 CAMERA_SIDE = (PANEL_WIDTH - 3 * MARGIN) // 2
 BAR_LEFT, BAR_WIDTH, BAR_HEIGHT = MARGIN + 32, 304, 9
 ROW_HEIGHT = 25
+
+# Layout of a strip of pictures (px).
+STRIP_GAP, STRIP_TITLE = 6, 20
 
 PAPER, INK, FAINT, TRACK = (250, 250, 248), (30, 32, 36), (110, 114, 120), (226, 227, 224)
 ORANGE, GREEN, RED = (233, 98, 10), (22, 128, 60), (190, 30, 30)
@@ -170,6 +174,35 @@ def write_film(path: Path, frames: Sequence[Picture], frames_per_second: float) 
             _write_gif(temporary, frames, frames_per_second)
         else:
             _write_mp4(temporary, frames, frames_per_second)
+
+
+def strip(rows: Mapping[str, Sequence[Picture]], times_s: Sequence[float]) -> "Image":
+    """Lay pictures out in rows, evenly spaced in time.
+
+    Args:
+        rows: Title of each row to its pictures, all square and of one size.
+        times_s: Time of each column (s); the first is not written.
+
+    Returns:
+        The sheet.
+    """
+    from PIL import Image, ImageDraw
+
+    side = next(iter(rows.values()))[0].shape[0]
+    pitch = side + STRIP_GAP
+    size = (STRIP_GAP + len(times_s) * pitch, STRIP_GAP + len(rows) * (pitch + STRIP_TITLE))
+    sheet = Image.new("RGB", size, PAPER)
+    draw = ImageDraw.Draw(sheet)
+    for row, (title, pictures) in enumerate(rows.items()):
+        y = STRIP_GAP + row * (pitch + STRIP_TITLE)
+        draw.text((STRIP_GAP, y), title, INK, font(13, bold=True))
+        for column, (picture, time_s) in enumerate(zip(pictures, times_s, strict=True)):
+            x = STRIP_GAP + column * pitch
+            sheet.paste(Image.fromarray(picture), (x, y + STRIP_TITLE))
+            # The first column's title stands where its time would.
+            if column:
+                draw.text((x + side, y + 1), f"{time_s:.1f} s", FAINT, font(12), anchor="ra")
+    return sheet
 
 
 def check_film_suffix(path: Path) -> None:

@@ -208,21 +208,33 @@ def _processors_are_standard(folder: Path) -> bool:
     return True
 
 
-def _network(folder: Path, config: Mapping[str, Any]) -> tuple[Decide, Callable[[], None]]:
-    """Load the network of an `hvs` checkpoint, without LeRobot."""
+def load_network(folder: Path, config: Mapping[str, Any]) -> HvsNetwork:
+    """Load the network of an `hvs` checkpoint, without LeRobot.
+
+    Args:
+        folder: The checkpoint.
+        config: Its ``config.json``, parsed.
+
+    Raises:
+        PolicyError: It cannot be loaded.
+    """
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
     try:
-        shape = shape_from_config(config)
-        network = HvsNetwork(shape)
+        network = HvsNetwork(shape_from_config(config))
         weights = load_file(folder / "model.safetensors")
         network.load_state_dict({k.removeprefix(NETWORK_PREFIX): v for k, v in weights.items()})
     except (SafetensorError, OSError, KeyError, ValueError, RuntimeError) as error:
         reason = str(error).splitlines()[0]
         raise PolicyError(f"{folder} cannot be loaded as an hvs policy: {reason}") from error
-    network.eval()
+    return network.eval()
 
+
+def _network(folder: Path, config: Mapping[str, Any]) -> tuple[Decide, Callable[[], None]]:
+    """Play the network of an `hvs` checkpoint by itself."""
+    network = load_network(folder, config)
+    shape = network.shape
     memory: Tensor | None = None
 
     def decide(batch: dict[str, Tensor]) -> Tensor:

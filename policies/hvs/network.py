@@ -199,11 +199,7 @@ class Eye(nn.Module):
         Returns:
             Where it is, how large, and whether it is there.
         """
-        x = images.contiguous(memory_format=torch.channels_last) - 0.5
-        half = self.train_in_bfloat16 and self.training
-        with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=half):
-            maps = self.features(x)
-        maps = maps.float()
+        maps = self._maps(images)
         scores, outline = self.score(maps).unbind(dim=1)  # (B, h, w) each
         weights = torch.softmax(scores.flatten(1), dim=1)
         grid = weights.view_as(scores)
@@ -218,6 +214,26 @@ class Eye(nn.Module):
         correction, size, visible, trust = judged.split((2, 1, 1, 1), dim=1)
         uv = uv * self.uv_scale + self.uv_shift + correction
         return Sighting(uv, size, visible, trust)
+
+    def attention(self, images: Tensor) -> Tensor:
+        """Where the eye looks for the target.
+
+        Args:
+            images: (B, C, H, W) in [0, 1].
+
+        Returns:
+            The distribution whose mean is the keypoint, (B, h, w), summing to 1.
+        """
+        scores = self.score(self._maps(images))[:, 0]
+        return torch.softmax(scores.flatten(1), dim=1).view_as(scores)
+
+    def _maps(self, images: Tensor) -> Tensor:
+        """Feature maps, (B, channels, h, w)."""
+        x = images.contiguous(memory_format=torch.channels_last) - 0.5
+        half = self.train_in_bfloat16 and self.training
+        with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=half):
+            maps: Tensor = self.features(x)
+        return maps.float()
 
 
 def _moments(marginal: Tensor) -> tuple[Tensor, Tensor]:
