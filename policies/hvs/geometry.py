@@ -173,12 +173,15 @@ class Calibration:
         homography: Eye-to-hand: (u, v, 1) to (x, y, 1) on the surface, (3, 3).
         plane_height_m: Mean height of the targets (m).
         standoff_m: Distance between flange face and target at the goal (m).
+        size_at_1m: Apparent diameter of the target in the eye in hand (image widths) times its
+            depth (m); 0 if it was never seen.
     """
 
     rays: FloatArray
     homography: FloatArray
     plane_height_m: float
     standoff_m: float
+    size_at_1m: float
 
 
 def calibrate(
@@ -205,18 +208,19 @@ def calibrate(
         The calibration.
     """
     target = goal_position - standoff_m * goal_normal
-    rays, homography = np.diag([0.7, 0.7, 1.0]), np.eye(3)
+    rays, homography, size_at_1m = np.diag([0.7, 0.7, 1.0]), np.eye(3), 0.0
     if target_eih is not None and (seen := _seen(target_eih)).sum() >= MIN_CALIBRATION_FRAMES:
         motion = flange_motion(torch.from_numpy(np.asarray(q[seen], np.float64)))
         offset = target[seen] - motion.position.numpy()
         direction = np.einsum("nji,nj->ni", motion.rotation.numpy(), offset)
         rays = _direct_linear(target_eih[seen, :2], direction)
+        size_at_1m = float(np.median(target_eih[seen, 2] * direction[:, 2]))
     if target_eth is not None and (seen := _seen(target_eth)).sum() >= MIN_CALIBRATION_FRAMES:
         ones = np.ones((int(seen.sum()), 1))
         homography = _direct_linear(
             target_eth[seen, :2], np.concatenate([target[seen, :2], ones], axis=1)
         )
-    return Calibration(rays, homography, float(target[:, 2].mean()), standoff_m)
+    return Calibration(rays, homography, float(target[:, 2].mean()), standoff_m, size_at_1m)
 
 
 def _seen(target: FloatArray) -> npt.NDArray[np.bool_]:

@@ -258,6 +258,7 @@ class HvsNetwork(nn.Module):
     homography: Tensor
     plane_height: Tensor
     standoff: Tensor
+    size_at_1m: Tensor
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
@@ -273,12 +274,14 @@ class HvsNetwork(nn.Module):
         self.register_buffer("homography", torch.eye(3))
         self.register_buffer("plane_height", torch.tensor(0.0))
         self.register_buffer("standoff", torch.tensor(0.05))
+        self.register_buffer("size_at_1m", torch.tensor(0.0))
         n_cameras = len(shape.cameras)
         width = SIGHTING_FEATURES * n_cameras
         if shape.state_dim:
             # Each camera's estimate, the better of two, the remembered one.
             n_estimates = n_cameras + (n_cameras > 1) + 1
             width += 3 * N_JOINTS + 12 + ESTIMATE_FEATURES * n_estimates + N_JOINTS
+            width += "eih" in shape.cameras
             if shape.state_dim == POSITIONS_AND_VELOCITIES:
                 width += N_JOINTS
         hidden = shape.hidden
@@ -303,6 +306,7 @@ class HvsNetwork(nn.Module):
         self.homography.copy_(torch.from_numpy(calibration.homography))
         self.plane_height.fill_(calibration.plane_height_m)
         self.standoff.fill_(calibration.standoff_m)
+        self.size_at_1m.fill_(calibration.size_at_1m)
 
     def look(self, images: Mapping[str, Tensor]) -> dict[str, Sighting]:
         """Run the eyes.
@@ -355,6 +359,11 @@ class HvsNetwork(nn.Module):
         step = torch.asinh(geometry.joint_step(motion, target + lift - motion.position) / scale)
         features += [torch.sin(q), torch.cos(q), q / self.joint_range]
         features += [motion.position, motion.rotation.flatten(1), step]
+        if "eih" in sightings:
+            # Where the joints lie about the height, the disc's size tells the truth.
+            diameter = torch.exp(sightings["eih"].log_diameter.clamp(-5.0, 2.0))
+            depth = (self.size_at_1m / diameter).clamp(max=2.0)
+            features.append(torch.asinh((depth - self.standoff) / scale))
         if self.shape.state_dim == POSITIONS_AND_VELOCITIES:
             features.append(state[:, N_JOINTS:] / self.joint_speed)
         for estimate in estimates:

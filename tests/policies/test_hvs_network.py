@@ -73,7 +73,7 @@ def test_calibration_finds_the_cameras_that_made_the_data():
     uv_eih /= (offset @ np.linalg.inv(rays).T)[:, 2:]
     homography = np.array([[0.0, 0.9, 0.1], [-1.0, 0.1, 0.0], [0.05, 0.1, 1.0]])
     mapped = np.column_stack([target[:, :2], np.ones(n)]) @ np.linalg.inv(homography).T
-    seen = np.column_stack([np.full(n, 0.1), np.ones(n)])
+    seen = np.column_stack([0.04 / offset[:, 2], np.ones(n)])
     found = geometry.calibrate(
         q=q,
         goal_position=target + np.array([0.0, 0.0, 0.05]),
@@ -85,6 +85,7 @@ def test_calibration_finds_the_cameras_that_made_the_data():
     np.testing.assert_allclose(found.rays, rays, atol=1e-6)
     np.testing.assert_allclose(found.homography, homography, atol=1e-6)
     assert found.plane_height_m == pytest.approx(0.0)
+    assert found.size_at_1m == pytest.approx(0.04)
 
 
 @pytest.mark.parametrize("state_dim", [0, 7, 14])
