@@ -26,6 +26,27 @@ LINEARISATION_RANGE_RAD = 0.30
 MIN_CALIBRATION_FRAMES = 60
 
 
+def _joint_tables() -> tuple[Tensor, ...]:
+    """What makes the turn of joint i: fixed + sine sin(q) + cosine cos(q), and the ways between.
+
+    Rodrigues' formula for a unit axis a: a a^T + sin(q) [a]_x + cos(q) (I - a a^T).
+
+    Returns:
+        Three of (7, 3, 3), the ways along z to each joint and on to the flange (8, 1) m, and the
+        joints' axes (7, 3).
+    """
+    axes = torch.tensor(JOINT_AXES, dtype=torch.float64)
+    along = axes[:, :, None] * axes[:, None]
+    x, y, z = axes.unbind(dim=1)
+    zero = torch.zeros_like(x)
+    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).view(-1, 3, 3)
+    heights = torch.tensor([0.0, *JOINT_HEIGHTS_M, FLANGE_HEIGHT_M], dtype=torch.float64)
+    return along, skew, torch.eye(3, dtype=torch.float64) - along, heights.diff()[:, None], axes
+
+
+_JOINTS = _joint_tables()
+
+
 @dataclasses.dataclass(frozen=True)
 class FlangeMotion:
     """Pose of the flange and how the joints move it.
@@ -50,34 +71,20 @@ def flange_motion(q: Tensor) -> FlangeMotion:
     Returns:
         Pose and geometric Jacobian of the flange.
     """
-    rotation = torch.eye(3, dtype=q.dtype, device=q.device).expand(q.shape[0], 3, 3)
-    position = q.new_zeros(q.shape[0], 3)
-    origins, axes = [], []
-    height = 0.0
-    for i, (axis, joint_height) in enumerate(zip(JOINT_AXES, JOINT_HEIGHTS_M, strict=True)):
-        position = position + rotation[:, :, 2] * (joint_height - height)
-        height = joint_height
-        sign = float(sum(axis))
-        index = 2 if axis[2] else 1
-        origins.append(position)
-        axes.append(sign * rotation[:, :, index])
-        rotation = rotation @ _turn(index, sign * q[:, i])
-    position = position + rotation[:, :, 2] * (FLANGE_HEIGHT_M - height)
-    axis_stack = torch.stack(axes, dim=2)  # (B, 3, 7)
-    lever = position[:, :, None] - torch.stack(origins, dim=2)
-    linear = torch.linalg.cross(axis_stack, lever, dim=1)
-    return FlangeMotion(position, rotation, torch.cat([linear, axis_stack], dim=1))
-
-
-def _turn(index: int, angle: Tensor) -> Tensor:
-    """Rotation about the y (1) or z (2) axis, (B, 3, 3)."""
-    c, s = torch.cos(angle), torch.sin(angle)
-    zero, one = torch.zeros_like(c), torch.ones_like(c)
-    if index == 1:
-        rows = [c, zero, s, zero, one, zero, -s, zero, c]
-    else:
-        rows = [c, -s, zero, s, c, zero, zero, zero, one]
-    return torch.stack(rows, dim=1).view(-1, 3, 3)
+    fixed, sine, cosine, ways, joint_axes = (table.to(q) for table in _JOINTS)
+    angle = q[:, :, None, None]
+    turns = fixed + sine * torch.sin(angle) + cosine * torch.cos(angle)  # (B, 7, 3, 3)
+    # The frame before each joint's turn, and the flange's.
+    frames = [torch.eye(3, dtype=q.dtype, device=q.device).expand(len(q), 3, 3)]
+    for turn in turns.unbind(dim=1):
+        frames.append(frames[-1] @ turn)
+    rotations = torch.stack(frames, dim=1)  # (B, 8, 3, 3)
+    places = torch.cumsum(rotations[..., 2] * ways, dim=1)  # (B, 8, 3)
+    position = places[:, -1]
+    axes = (rotations[:, :-1] @ joint_axes[..., None])[..., 0]  # (B, 7, 3)
+    linear = torch.linalg.cross(axes, position[:, None] - places[:, :-1], dim=2)
+    jacobian = torch.cat([linear, axes], dim=2).transpose(1, 2)
+    return FlangeMotion(position, rotations[:, -1], jacobian)
 
 
 def joint_step(motion: FlangeMotion, offset: Tensor) -> Tensor:

@@ -178,7 +178,7 @@ class Eye(nn.Module):
             width = channels
         self.features = nn.Sequential(*layers)
         # One channel for the centre, one for the outline.
-        self.score = nn.Conv2d(channels, 2, 1)
+        self.score = nn.Linear(channels, 2)
         # A mean over cells cannot reach the border, and strides shift it by a fraction of a cell.
         self.uv_scale = nn.Parameter(torch.full((2,), 1.05))
         self.uv_shift = nn.Parameter(torch.zeros(2))
@@ -199,16 +199,16 @@ class Eye(nn.Module):
         Returns:
             Where it is, how large, and whether it is there.
         """
-        maps = self._maps(images)
-        scores, outline = self.score(maps).unbind(dim=1)  # (B, h, w) each
+        maps = self._maps(images)  # (B, h, w, channels)
+        scores, outline = self.score(maps).unbind(dim=3)  # (B, h, w) each
         weights = torch.softmax(scores.flatten(1), dim=1)
         grid = weights.view_as(scores)
         u, u_spread = _moments(grid.sum(dim=1))
         v, v_spread = _moments(grid.sum(dim=2))
         uv = torch.cat([u, v], dim=1)
-        flat = maps.flatten(2)
+        flat = maps.flatten(1, 2)
         filled = F.adaptive_avg_pool2d(torch.sigmoid(outline)[:, None], OUTLINE_SIZE)
-        pooled = [(flat * weights[:, None]).sum(dim=2), flat.amax(dim=2), filled.flatten(1)]
+        pooled = [(weights[:, None] @ flat)[:, 0], flat.amax(dim=1), filled.flatten(1)]
         judged = self.judge(torch.cat([*pooled, uv, u_spread, v_spread], dim=1))
         # A disc that is cut by the image's border has its centre elsewhere than what is in view.
         correction, size, visible, trust = judged.split((2, 1, 1, 1), dim=1)
@@ -224,16 +224,16 @@ class Eye(nn.Module):
         Returns:
             The distribution whose mean is the keypoint, (B, h, w), summing to 1.
         """
-        scores = self.score(self._maps(images))[:, 0]
+        scores = self.score(self._maps(images))[..., 0]
         return torch.softmax(scores.flatten(1), dim=1).view_as(scores)
 
     def _maps(self, images: Tensor) -> Tensor:
-        """Feature maps, (B, channels, h, w)."""
+        """Features of every cell, (B, h, w, channels)."""
         x = images.contiguous(memory_format=torch.channels_last) - 0.5
         half = self.train_in_bfloat16 and self.training
         with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=half):
             maps: Tensor = self.features(x)
-        return maps.float()
+        return maps.float().permute(0, 2, 3, 1)
 
 
 def _moments(marginal: Tensor) -> tuple[Tensor, Tensor]:
