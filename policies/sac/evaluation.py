@@ -1,0 +1,142 @@
+"""How an actor stands amid its training: a few scenes of their own split, and a clip."""
+
+import dataclasses
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hvs_suite.files import replacing
+from hvs_suite.pictures import film_episode, write_film
+from hvs_suite.registry import load
+from hvs_suite.rollout import Policy, run_episode
+from hvs_suite.tasks.variants import AlignVariant
+
+if TYPE_CHECKING:
+    from hvs_suite.cell.environment import Environment
+
+SPLIT = "validation"
+"""Neither what is trained on nor what is scored."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """Greedy episodes after some training; means over the episodes.
+
+    Attributes:
+        env_steps: Environment steps trained.
+        updates: Updates done.
+        episodes: Episodes played.
+        episode_return: Undiscounted sum of rewards.
+        length: Control steps.
+        success_rate: Share that reached the goal.
+        collision_rate: Share that ended in a forbidden contact.
+        position_error_mm: At the end of the episode (mm).
+        tilt_error_deg: At the end of the episode (deg).
+    """
+
+    env_steps: int
+    updates: int
+    episodes: int
+    episode_return: float
+    length: float
+    success_rate: float
+    collision_rate: float
+    position_error_mm: float
+    tilt_error_deg: float
+
+    def figures(self) -> dict[str, float]:
+        """What goes on the board, by name."""
+        names = [field.name for field in dataclasses.fields(self)][3:]
+        return {name: float(getattr(self, name)) for name in names}
+
+
+class Examiner:
+    """Plays the first scenes of `SPLIT`, always the same ones.
+
+    Attributes:
+        episodes: Scenes that an evaluation plays.
+
+    Args:
+        variant: The named task.
+        options: Task options that differ from it.
+        episodes: Scenes to play.
+    """
+
+    def __init__(self, variant: AlignVariant, options: Mapping[str, Any], episodes: int) -> None:
+        self._env: Environment = load(variant.name, split=SPLIT, **options)
+        self.episodes = episodes
+
+    def evaluate(
+        self,
+        policy: Policy,
+        env_steps: int,
+        updates: int,
+        clip: Path | None = None,
+        on_episode: Callable[[int], None] | None = None,
+    ) -> Evaluation:
+        """Play every scene once.
+
+        Args:
+            policy: Without exploration.
+            env_steps: Environment steps trained so far.
+            updates: Updates done so far.
+            clip: Film of scene 0 to write (.mp4 or .gif).
+            on_episode: Called with the number of episodes played.
+        """
+        rewards: list[float] = []
+        played = []
+        for scenario in range(self.episodes):
+            played.append(
+                run_episode(
+                    self._env, policy, scenario, lambda *step: rewards.append(float(step[3].reward))
+                )
+            )
+            if on_episode is not None:
+                on_episode(scenario + 1)
+        if clip is not None:
+            _, frames = film_episode(self._env, policy, 0)
+            write_film(clip, frames, 1.0 / self._env.variant.control_period_s)
+        return Evaluation(
+            env_steps=env_steps,
+            updates=updates,
+            episodes=len(played),
+            episode_return=sum(rewards) / len(played),
+            length=float(np.mean([episode.steps for episode in played])),
+            success_rate=float(np.mean([episode.success for episode in played])),
+            collision_rate=float(np.mean([episode.collision for episode in played])),
+            position_error_mm=float(np.mean([episode.position_error_mm for episode in played])),
+            tilt_error_deg=float(np.mean([episode.tilt_error_deg for episode in played])),
+        )
+
+    def close(self) -> None:
+        """Free the environment."""
+        self._env.close()
+
+
+def read_evaluations(path: Path, env_steps: int) -> list[Evaluation]:
+    """Evaluations of a run up to where it is resumed; none if there is no file.
+
+    Args:
+        path: As given to `write_evaluations`.
+        env_steps: Later ones belong to a sitting that was lost.
+    """
+    try:
+        rows = [Evaluation(**row) for row in json.loads(path.read_bytes())]
+    except (OSError, ValueError, TypeError):
+        return []
+    return [row for row in rows if row.env_steps <= env_steps]
+
+
+def write_evaluations(path: Path, evaluations: list[Evaluation]) -> None:
+    """Write the evaluations of a run as JSON.
+
+    Args:
+        path: The file.
+        evaluations: In order.
+    """
+    with replacing(path) as temporary:
+        rows = [dataclasses.asdict(row) for row in evaluations]
+        temporary.write_text(json.dumps(rows, indent=2) + "\n")
