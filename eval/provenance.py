@@ -121,9 +121,17 @@ class Training:
 
 
 def training(folder: Path) -> Training:
-    """Reads ``training/outcome.json``, which ``hvs pretrain`` leaves in a checkpoint."""
+    """Reads ``training/outcome.json``, which our training commands leave in a checkpoint.
+
+    ``lerobot-train`` keeps its steps beside the checkpoint, and no hours.
+    """
     try:
         outcome = json.loads((folder / "training" / "outcome.json").read_bytes())
         return Training(int(outcome["step"]), float(outcome["train_s"]) / 3600.0)
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    try:
+        state = json.loads((folder.parent / "training_state" / "training_step.json").read_bytes())
+        return Training(int(state["step"]), None)
     except (OSError, ValueError, KeyError, TypeError):
         return Training(None, None)

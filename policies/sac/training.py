@@ -18,12 +18,12 @@ from typing import Any
 import torch
 from gymnasium import spaces
 from stable_baselines3 import SAC
-from stable_baselines3.common.logger import KVWriter, Logger
-from torch.utils.tensorboard import SummaryWriter
+from stable_baselines3.common.logger import Logger
 
 from hvs_suite.errors import OptionError
 from hvs_suite.files import replacing
 from hvs_suite.policies.run_folder import claim
+from hvs_suite.policies.sac.curves import Curves
 from hvs_suite.policies.sac.evaluation import (
     Evaluation,
     Examiner,
@@ -217,12 +217,12 @@ class _Run:
         self._evaluations = read_evaluations(
             self._training / "evaluations.json", model.num_timesteps
         )
-        self._board = _Board(self._training / "tensorboard", model.num_timesteps)
-        model.set_logger(Logger(None, [self._board]))
+        self._curves = Curves(self._training / "tensorboard", model.num_timesteps)
+        model.set_logger(Logger(None, [self._curves]))
 
     def close(self) -> None:
         """Close the curves."""
-        self._board.close()
+        self._curves.close()
 
     def train(
         self, budget: _Budget, settings: Settings, eval_every: int, checkpoint_period_s: float
@@ -281,7 +281,7 @@ class _Run:
         )
         self._evaluations.append(evaluation)
         write_evaluations(self._training / "evaluations.json", self._evaluations)
-        self._board.add({f"eval/{k}": v for k, v in evaluation.figures().items()}, env_steps)
+        self._curves.add({f"eval/{k}": v for k, v in evaluation.figures().items()}, env_steps)
 
     def _checkpoint(self) -> None:
         save_run(self._training, self._model, self._journal, self._counters)
@@ -318,36 +318,6 @@ class _Run:
                 evaluation=self._evaluations[-1] if self._evaluations else None,
             )
         )
-
-
-class _Board(KVWriter):
-    """SB3's figures as TensorBoard curves; unlike SB3's own writer, it cuts off a lost sitting.
-
-    Args:
-        folder: Of the event files.
-        env_steps: Where this sitting begins.
-    """
-
-    def __init__(self, folder: Path, env_steps: int) -> None:
-        # Points of a sitting that was killed lie beyond the step at which its checkpoint was made.
-        self._writer = SummaryWriter(str(folder), purge_step=env_steps + 1)
-
-    def write(
-        self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0
-    ) -> None:
-        """Take what SB3 dumps."""
-        del key_excluded
-        self.add({k: v for k, v in key_values.items() if isinstance(v, int | float)}, step)
-
-    def add(self, figures: Mapping[str, float], step: int) -> None:
-        """Add a point to each curve."""
-        for name, value in figures.items():
-            self._writer.add_scalar(name, float(value), step)
-        self._writer.flush()
-
-    def close(self) -> None:
-        """Close the event file."""
-        self._writer.close()
 
 
 def _make_model(journal: Journal, settings: Settings, seed: int, device: str) -> SAC:

@@ -95,7 +95,7 @@ def test_edit_dataset_informs_splits_and_merges(tmp_path):
     assert [str(each) for each in check_dataset(tmp_path / "merged", pictures=False).damage] == []
 
 
-def test_act_trains_for_a_few_steps(tmp_path):
+def test_act_trains_for_a_few_steps_and_is_scored(tmp_path):
     done = call(
         tmp_path, "lerobot-train", "--dataset.repo_id=local/sample", f"--dataset.root={SAMPLE}",
         "--policy.type=act", "--policy.device=cpu", "--policy.push_to_hub=false",
@@ -108,6 +108,19 @@ def test_act_trains_for_a_few_steps(tmp_path):
     assert_done(done)
     [model] = (tmp_path / "act").rglob("model.safetensors")
     assert model.stat().st_size > 100_000
+    # As docs/baselines.md says: what stock training leaves is scored like any policy.
+    checkpoint, result = tmp_path / "act/checkpoints/last/pretrained_model", tmp_path / "act.json"
+    done = call(
+        tmp_path, "hvs", "evaluate", "--policy", checkpoint, "--task", "align-thesis",
+        "--episodes", "1", "--decision-limit", "60", "--out", result,
+    )  # fmt: skip
+    assert_done(done)
+    scored = json.loads(result.read_text())
+    assert scored["summary"]["failures"] == {}
+    assert (scored["metadata"]["policy_kind"], scored["metadata"]["training_steps"]) == (
+        "checkpoint",
+        2,
+    )
 
 
 def test_hub_gets_every_file_and_nobody_sees_the_token(tmp_path):
