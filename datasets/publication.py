@@ -26,15 +26,19 @@ _VIDEO_BACKEND = "pyav"
 
 @dataclasses.dataclass(frozen=True)
 class Encoding:
-    """How pictures become video.
+    """How pictures become video; LeRobot's own choice by default.
 
     Attributes:
-        codec: FFmpeg's name of the encoder.
+        codec: LeRobot's name of the encoder.
         crf: Constant rate factor; lower is better and larger.
+        pixel_format: FFmpeg's name; yuv420p keeps a colour for four pixels, yuv444p for each.
+        keyframe_interval: Frames from one that is kept whole to the next.
     """
 
     codec: str = "libsvtav1"
     crf: int = 30
+    pixel_format: str = "yuv420p"
+    keyframe_interval: int = 2
 
 
 def check_repository(repository: str) -> None:
@@ -108,6 +112,29 @@ def hub_errors(repository: str) -> Iterator[None]:
         ) from None
 
 
+def check_encoding(encoding: Encoding) -> None:
+    """Refuses what this machine's FFmpeg cannot encode, before any work is done.
+
+    Raises:
+        OptionError: The build lacks the encoder, or the encoder the pixel format.
+    """
+    import av
+
+    try:
+        encoder = av.codec.Codec(encoding.codec, "w")
+    except av.codec.codec.UnknownCodecError:
+        raise OptionError(
+            f"the FFmpeg that PyAV {av.__version__} brings has no encoder {encoding.codec}; leave "
+            "it out, or install a PyAV that has it"
+        ) from None
+    offered = [each.name for each in encoder.video_formats or ()]
+    if encoding.pixel_format not in offered:
+        raise OptionError(
+            f"{encoding.codec} does not encode {encoding.pixel_format}; choose from "
+            f"{', '.join(offered)}"
+        )
+
+
 def convert_to_video(root: Path, out: Path, encoding: Encoding) -> None:
     """Writes a copy of a dataset whose pictures are videos, with LeRobot's own conversion.
 
@@ -125,12 +152,19 @@ def convert_to_video(root: Path, out: Path, encoding: Encoding) -> None:
     from lerobot.configs.video import RGBEncoderConfig
     from lerobot.datasets.dataset_tools import convert_image_to_video_dataset
 
-    with _quiet():
+    # SVT-AV1 greets each video with twenty lines, past Python's own streams; errors remain.
+    os.environ.setdefault("SVT_LOG", "1")
+    with _quiet(), _own_schedule():
         convert_image_to_video_dataset(
             dataset,
             output_dir=out,
             repo_id=dataset.repo_id,
-            rgb_encoder=RGBEncoderConfig(vcodec=encoding.codec, crf=encoding.crf),
+            rgb_encoder=RGBEncoderConfig(
+                vcodec=encoding.codec,
+                crf=encoding.crf,
+                pix_fmt=encoding.pixel_format,
+                g=encoding.keyframe_interval,
+            ),
             num_workers=1,
         )
     # LeRobot drops the pictures' statistics on the way, without which nothing can be normalised;
@@ -151,6 +185,23 @@ def _quiet() -> Iterator[None]:
     """Keeps progress bars of libraries off standard output, where results are printed."""
     with contextlib.redirect_stdout(sys.stderr):
         yield
+
+
+@contextlib.contextmanager
+def _own_schedule() -> Iterator[None]:
+    """Gives this thread its scheduling back.
+
+    Where it may, as root, SVT-AV1 makes the thread that calls it a real-time one for good: it would
+    run before everything else on the machine, whatever its nice value.
+    """
+    if not hasattr(os, "sched_setscheduler"):
+        yield
+        return
+    policy, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, policy, parameter)
 
 
 def _without_tokens(text: str) -> str:

@@ -38,6 +38,7 @@ COMMANDS = {
     "import-lerobot": "hvs_suite.cli.import_lerobot:ImportLerobot",
     "leaderboard": "hvs_suite.cli.leaderboard:Leaderboard",
     "bench": "hvs_suite.cli.bench:Bench",
+    "study": "hvs_suite.cli.study:Study",
     "doctor": "hvs_suite.cli.doctor:Doctor",
     "demo": "hvs_suite.cli.demo:Demo",
     "reproduce": "hvs_suite.cli.reproduce:Reproduce",
