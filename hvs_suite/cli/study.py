@@ -2,11 +2,12 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from hvs_suite.cli import console
+from hvs_suite.errors import OptionError
 
 # As `hvs demo` records: without disturbance and starts near the goal nothing is learnt.
 NOISE_RAD = 0.02
@@ -47,7 +48,7 @@ class Compression:
     def run(self) -> None:
         """Measure, showing how it goes; write and print what was found."""
         from hvs_suite.eval import compression_report, compression_study
-        from hvs_suite.files import check_writable, replacing
+        from hvs_suite.files import check_writable
 
         check_writable(self.out / "study.json")
         settings = self.setting or compression_study.DEFAULT_SETTINGS
@@ -58,16 +59,7 @@ class Compression:
         with console.meter() as update:
             study = compression_study.run_study(data, self.out, encodings, training, update)
         text = compression_report.markdown(study)
-        for name, content in (
-            ("study.json", study.model_dump_json(indent=2) + "\n"),
-            ("study.md", text),
-        ):
-            with replacing(self.out / name) as temporary:
-                temporary.write_text(content, encoding="utf-8")
-        with replacing(self.out / "study.png") as temporary:
-            compression_report.draw(study).savefig(temporary)
-        print(text, end="")
-        print(f"wrote {self.out / 'study.json'}, study.md and study.png")
+        _write(self.out, study.model_dump_json(indent=2), text, compression_report.draw(study))
 
     def _recorded(self) -> Path:
         """The study's own recording, gone on with where it was interrupted."""
@@ -87,17 +79,120 @@ class Compression:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Ablation:
+    """Measure what each choice of the hvs policy buys, by training without it.
+
+    Every policy learns from the same data with the same seed and steps, and is judged on the same
+    scenarios of split dev. Interrupted, the same command goes on.
+
+    Attributes:
+        data: Recorded dataset; its task is played.
+        out: Folder of the study: study.json, study.md, study.png, and a sub-folder a policy.
+        row: What to leave out, such as "no joints"; give it several times; everything that can be
+            left out by default.
+        steps: Optimiser steps of each policy.
+        dagger_rounds: DAgger rounds, where they are not what is left out.
+        dagger_frames: Frames a round.
+        episodes: Scenarios that each policy is judged on.
+        seed: Of every policy's weights and order.
+        workers: Processes that play.
+    """
+
+    data: Path
+    out: Path
+    row: tuple[str, ...] = ()
+    steps: int = 4000
+    dagger_rounds: int = 3
+    dagger_frames: int = 6000
+    episodes: int = 200
+    seed: int = 0
+    workers: int = 2
+
+    def run(self) -> None:
+        """Train and judge, showing how it goes; write and print what was found."""
+        from hvs_suite.eval import ablation_study
+        from hvs_suite.files import check_writable
+
+        check_writable(self.out / "study.json")
+        budget = ablation_study.Budget(
+            steps=self.steps,
+            dagger_rounds=self.dagger_rounds,
+            dagger_frames=self.dagger_frames,
+            seed=self.seed,
+            episodes=self.episodes,
+            workers=self.workers,
+        )
+        rows = self.row or tuple(ablation_study.ABLATIONS)
+        with console.meter() as update:
+            study = ablation_study.run_study(self.data, self.out, rows, budget, update)
+        text = ablation_study.markdown(study)
+        _write(self.out, study.model_dump_json(indent=2), text, ablation_study.draw(study))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Attention:
+    """Draw where an hvs policy looks in both cameras, through one episode.
+
+    Yellow is its attention; the cross is where it takes the target to be, the circle where it is.
+
+    Attributes:
+        policy: Checkpoint folder, or pretrained for the weights shipped for the task.
+        task: Named task.
+        out: Picture to write (.png).
+        split: Split of the scenario.
+        scenario: Which one.
+    """
+
+    policy: str
+    task: str
+    out: Path
+    split: str = "dev"
+    scenario: int = 0
+
+    def run(self) -> None:
+        """Play, draw and write."""
+        import hvs_suite
+        from hvs_suite.files import check_writable, replacing
+        from hvs_suite.policies.attention import draw_attention
+        from hvs_suite.policies.catalogue import policy_factory
+
+        check_writable(self.out)
+        make = policy_factory(self.policy, self.task)
+        folder = getattr(make, "folder", None)
+        if folder is None:
+            raise OptionError(f"{self.policy} has no network to look into; name a checkpoint")
+        with hvs_suite.load(self.task, split=self.split) as env:
+            sheet = draw_attention(Path(folder), env, make(env), self.scenario)
+        with replacing(self.out) as temporary:
+            sheet.save(temporary, "PNG")
+        print(f"wrote {self.out}")
+
+
+def _write(out: Path, content: str, text: str, figure: Any) -> None:
+    """Write a study as JSON, Markdown and picture, and print its table."""
+    from hvs_suite.files import replacing
+
+    for name, written in (("study.json", content + "\n"), ("study.md", text)):
+        with replacing(out / name) as temporary:
+            temporary.write_text(written, encoding="utf-8")
+    with replacing(out / "study.png") as temporary:
+        figure.savefig(temporary)
+    print(text, end="")
+    print(f"wrote {out / 'study.json'}, study.md and study.png")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Study:
-    """Run an experiment about the suite itself: what compression costs.
+    """Run an experiment about the suite itself: compression, ablation, attention.
 
     Attributes:
         study: Which one.
     """
 
     study: Annotated[
-        # A union needs two members to become a choice of words, even while there is one study.
         Annotated[Compression, tyro.conf.subcommand("compression")]
-        | Annotated[None, tyro.conf.Suppress],
+        | Annotated[Ablation, tyro.conf.subcommand("ablation")]
+        | Annotated[Attention, tyro.conf.subcommand("attention")],
         tyro.conf.OmitSubcommandPrefixes,
         tyro.conf.OmitArgPrefixes,
     ]
