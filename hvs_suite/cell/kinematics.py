@@ -7,6 +7,7 @@ at the flange face centre, +z out along the tool axis.
 import functools
 import pathlib
 import tempfile
+from collections.abc import Sequence
 
 import coal
 import numpy as np
@@ -17,6 +18,7 @@ from hvs_suite.cell import robot
 
 FloatArray = npt.NDArray[np.float64]
 
+_UP = (0.0, 0.0, 1.0)
 _SHOULDER = np.array([0.0, 0.0, robot.BASE_TO_SHOULDER_M])
 _SINGULAR = 1e-9
 """Below this sine of A2 or A6 the two axes beside it coincide."""
@@ -44,7 +46,10 @@ _BRANCH_SHIFT, _BRANCH_SIGN = _branches()
 
 def _wrap(angle: FloatArray) -> FloatArray:
     """The same angles within [-pi, pi) rad."""
-    return (angle + np.pi) % (2.0 * np.pi) - np.pi
+    turned = angle + np.pi
+    # NumPy's remainder takes ten times as long.
+    turned -= np.floor(turned / (2.0 * np.pi)) * (2.0 * np.pi)
+    return turned - np.pi
 
 
 def _zyz_angles(R: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -140,25 +145,14 @@ class Kinematics:
                 if abs(first.parentJoint - objects[j].parentJoint) > 2:
                     self.geometry.addCollisionPair(pin.CollisionPair(i, j))
         # Base and link 1 can never come closer to the surface than they stand.
-        movable = [g for g in objects if g.parentJoint >= 2]
-        joints = sorted({int(g.parentJoint) for g in movable})
-        # Rotations (3, 3) and origins (3, 1) of these joints: views into Pinocchio's own memory, so
-        # that nothing has to be fetched joint by joint.
-        poses = self._data.oMi
-        self._joint_frames = [
-            part for j in joints for part in (poses[j].rotation, poses[j].translation[:, None])
-        ]
-        # One row a body: the part of a direction's components along these frames that is its
-        # centre's, and its axis'; (2 n, 4 joints).
-        self._bodies = np.zeros((2 * len(movable), 4 * len(joints)))
-        for row, body in enumerate(movable):
-            columns = 4 * joints.index(int(body.parentJoint)) + np.arange(4)
-            self._bodies[row, columns] = np.append(body.placement.translation, 1.0)
-            self._bodies[len(movable) + row, columns[:3]] = body.placement.rotation[:, 2]
-        shapes = [g.geometry for g in movable]
-        self._radius = np.array([shape.radius for shape in shapes])
-        self._half_length = np.array([shape.halfLength for shape in shapes])
-        self._is_cylinder = np.array([isinstance(shape, coal.Cylinder) for shape in shapes])
+        self._surface: tuple[float, tuple[float, ...]] = 0.0, _UP
+        self._half_space = coal.Halfspace(np.array(_UP), 0.0)
+        surface = self.geometry.addGeometryObject(
+            pin.GeometryObject("surface", 0, pin.SE3.Identity(), self._half_space)
+        )
+        for i, body in enumerate(objects):
+            if body.parentJoint >= 2:
+                self.geometry.addCollisionPair(pin.CollisionPair(i, surface))
 
     def flange_pose(self, q: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Rotation (3, 3) and position (3,) in m of the flange in the base frame."""
@@ -195,7 +189,7 @@ class Kinematics:
         self,
         q: npt.ArrayLike,
         surface_height_m: float = 0.0,
-        surface_normal: npt.ArrayLike = (0.0, 0.0, 1.0),
+        surface_normal: Sequence[float] | FloatArray = _UP,
     ) -> float:
         """Least distance (m) from links 2 to 7 to a plane surface, and between distant links.
 
@@ -207,17 +201,16 @@ class Kinematics:
             surface_height_m: Height of the surface over the base frame's origin (m).
             surface_normal: Its outward unit normal (3,), base frame.
         """
+        surface = surface_height_m, tuple(surface_normal)
+        if surface != self._surface:
+            self._surface = surface
+            normal = np.asarray(surface_normal, dtype=np.float64)
+            self._half_space.n, self._half_space.d = normal, surface_height_m * normal[2]
         q = np.asarray(q, dtype=np.float64)
-        normal = np.asarray(surface_normal, dtype=np.float64)
-        pin.updateGeometryPlacements(self.model, self._data, self.geometry, self._geometry_data, q)
-        frames = np.concatenate(self._joint_frames, axis=1)
-        height, axis_z = (self._bodies @ (normal @ frames)).reshape(2, -1)
-        # A capsule's end is a ball; a cylinder's a disc, whose rim dips by r sin(tilt).
-        dip = np.where(self._is_cylinder, np.sqrt(np.maximum(0.0, 1.0 - axis_z**2)), 1.0)
-        lowest = height - self._half_length * np.abs(axis_z) - self._radius * dip
-        nearest = pin.computeDistances(self.geometry, self._geometry_data)
-        between = self._geometry_data.distanceResults[nearest].min_distance
-        return float(min(between, lowest.min() - surface_height_m * normal[2]))
+        nearest = pin.computeDistances(
+            self.model, self._data, self.geometry, self._geometry_data, q
+        )
+        return float(self._geometry_data.distanceResults[nearest].min_distance)
 
     def inverse_kinematics(
         self,
