@@ -16,6 +16,7 @@ A decision is:
 from __future__ import annotations
 
 import collections.abc
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -46,6 +47,9 @@ LEAD_S = 0.025
 """How far the set point runs ahead of the motion (s): a little less than the joints' lag, tuned for
 the fewest steps. More overshoots the goal, less arrives late."""
 
+_FULL_SPEED: FloatArray = robot.JOINT_SPEED_RAD_S[:6, None]
+_SHORT_LIST = 128
+"""How many configurations to time at first; rarely more are needed."""
 _LAG_S: FloatArray = robot.DAMPING_NM_S_RAD / robot.STIFFNESS_NM_RAD
 """Each joint trails a moving set point by kv / kp (s)."""
 _MAX_PATHS = 24
@@ -88,9 +92,9 @@ def _stopping_travel_time(
     a = robot.JOINT_ACCELERATION_RAD_S2[: len(q), None]
     w = robot.JOINT_SPEED_RAD_S[: len(q), None]
     way = goals - q[:, None]
-    v = np.clip(velocity[:, None], -w, w)
-    onward = way - v * np.abs(v) / (2.0 * a) >= 0.0
-    x, u = np.where(onward, way, -way), np.where(onward, v, -v)
+    v = np.minimum(np.maximum(velocity[:, None], -w), w)
+    side = np.where(way >= v * np.abs(v) / (2.0 * a), 1.0, -1.0)
+    x, u = side * way, side * v
     peak = np.sqrt(np.maximum(a * x + 0.5 * v**2, 0.0))
     bang_bang = (2.0 * peak - u) / a
     cruising = (2.0 * w - u) / a + (x - (2.0 * w**2 - v**2) / (2.0 * a)) / w
@@ -104,24 +108,31 @@ def _soonest_first(
     """Configurations (7,) of a family (m, 7), the one reached soonest first.
 
     The first is nearly always clear, so it is found without ranking all: no time is below that at
-    full speed, and only configurations that could be soonest by that bound are timed.
+    full speed, so only configurations that could be soonest by that bound are timed.
     """
     # Joint by joint along the first axis: NumPy is slow over rows of seven.
     joints = np.ascontiguousarray(family[:, :6].T)
 
-    def price(which: npt.NDArray[np.intp]) -> FloatArray:
-        times, effort = _stopping_travel_time(q[:6], velocity[:6], joints[:, which])
+    def price(goals: FloatArray) -> FloatArray:
+        times, effort = _stopping_travel_time(q[:6], velocity[:6], goals)
         return times + TIE_BREAK_S * effort
 
-    way = np.abs(joints - q[:6, None])
-    bound = (way / robot.JOINT_SPEED_RAD_S[:6, None]).max(axis=0)
-    [limit] = price(np.argmin(bound, keepdims=True))
+    bound = (np.abs(joints - q[:6, None]) / _FULL_SPEED).max(axis=0)
+    last = min(_SHORT_LIST, len(family)) - 1
+    nearest = np.argpartition(bound, last)[: last + 1]
+    # In the family's order, on which equal prices depend.
+    listed = np.sort(nearest)
+    prices = price(joints.take(listed, axis=1))
     # A little slack, because both sides are rounded.
-    [within] = np.nonzero(bound <= limit + 1e-9)
-    first = within[np.argmin(price(within))]
+    limit = prices.min() + 1e-9
+    if limit >= bound[nearest[-1]]:
+        [listed] = np.nonzero(bound <= limit)
+        prices = price(joints.take(listed, axis=1))
+    first = int(listed[prices.argmin()])
     yield family[first]
-    order = np.argsort(price(np.arange(len(family))), kind="stable")
-    yield from family[order[order != first]]
+    for column in np.argsort(price(joints), kind="stable").tolist():
+        if column != first:
+            yield family[column]
 
 
 class Expert:
@@ -145,10 +156,14 @@ class Expert:
         self._kinematics: Kinematics = kinematics()
         self._period_s = env.variant.control_period_s
         self._goal_key: bytes = b""
-        self._family: FloatArray = np.empty((0, 7))
+        self._family: FloatArray = np.empty((7, 1))
+        """The goal's configurations, one a column; the last is kept free."""
         self._across: FloatArray = np.empty((2, 3))
         """Two directions along the goal's surface, (2, 3)."""
         self._floor_m = 0.0
+        self._clearance_m = 0.0
+        """Of the present state."""
+        self._decay = np.exp(-self._period_s / _LAG_S)
         self._ruckig = ruckig.Ruckig(7)
         self._input = ruckig.InputParameter(7)
         self._input.max_velocity = list(robot.JOINT_SPEED_RAD_S)
@@ -167,16 +182,21 @@ class Expert:
 
     def label(self) -> npt.NDArray[np.float32]:
         """The expert's action (7,) in [-1, 1] for the environment's present state."""
-        truth = self._env.privileged()
+        truth = self._truth()
         position, normal = truth["goal_position"], truth["goal_normal"]
         self._remember_goal(position, normal)
         # Distances are to a level plane. Elsewhere than on a flat surface that is the target's
         # height, which is right near the goal and a guess far from it.
         level = self._env.variant.surface == "flat"
-        self._floor_m = 0.0 if level else truth["target_position"][2] - CLEARANCE_M
+        self._floor_m = 0.0 if level else float(truth["target_position"][2]) - CLEARANCE_M
         q, velocity = self._state_when_action_acts()
+        self._clearance_m = self._kinematics.clearance(q, self._floor_m)
         target = self._next_set_point(q, velocity, position, normal)
         return np.asarray(self._env.commandable(target), dtype=np.float32)
+
+    def _truth(self) -> collections.abc.Mapping[str, FloatArray]:
+        """What the expert knows of the goal, keys as in ``Align.privileged``."""
+        return self._env.privileged()
 
     def _remember_goal(self, position: FloatArray, normal: FloatArray) -> None:
         """Computes the goal's family of configurations once a goal."""
@@ -184,9 +204,11 @@ class Expert:
         if key != self._goal_key:
             self._goal_key = key
             self._across = np.linalg.svd(normal[None])[2][1:]
-            self._family = self._kinematics.goal_configurations_at_tool_angle(
+            family = self._kinematics.goal_configurations_at_tool_angle(
                 position, normal, tool_angle=0.0, n_swivel=N_SWIVEL
             )
+            self._family = np.empty((7, len(family) + 1))
+            self._family[:, :-1] = family.T
 
     def _state_when_action_acts(self) -> tuple[FloatArray, FloatArray]:
         """True joint angles and velocities (7,), (7,) at the moment the action takes effect.
@@ -198,12 +220,11 @@ class Expert:
         env = self._env
         q, velocity = env.joint_positions, env.joint_velocities
         set_point = env.setpoint
-        decay = np.exp(-self._period_s / _LAG_S)
         for queued in env.pending_setpoints:
             limit = robot.JOINT_SPEED_RAD_S * self._period_s
             arrived = set_point + np.clip(queued - set_point, -limit, limit)
             trail = _LAG_S * (arrived - set_point) / self._period_s
-            q = arrived - trail + (q - set_point + trail) * decay
+            q = arrived - trail + (q - set_point + trail) * self._decay
             velocity = (arrived - q) / _LAG_S
             set_point = arrived
         return np.asarray(q), np.asarray(velocity)
@@ -215,7 +236,7 @@ class Expert:
         family = self._reachable(q, velocity, position, normal)
         if len(family) == 0:
             return q  # Out of reach: stand still.
-        required = min(CLEARANCE_M, self._kinematics.clearance(q, self._floor_m) - 1e-3)
+        required = min(CLEARANCE_M, self._clearance_m - 1e-3)
         candidates = _soonest_first(q, velocity, family)
         motion = self._first_clear(q, velocity, candidates, required)
         if motion is None:
@@ -263,7 +284,7 @@ class Expert:
         above = self._kinematics.goal_configurations_at_tool_angle(
             position + ESCAPE_HEIGHT_M * normal, normal, tool_angle=q[6], n_swivel=24
         )
-        rest = q + velocity * np.abs(velocity) / (2.0 * robot.JOINT_ACCELERATION_RAD_S2)
+        rest = _where_braking_ends(q, velocity)
         rest = np.clip(rest, -robot.JOINT_RANGE_RAD, robot.JOINT_RANGE_RAD)
         upright = np.append(np.zeros(6), rest[6])
         nearest = above[np.argsort(np.abs(above - rest).max(axis=1))[:_MAX_ESCAPES]]
@@ -280,20 +301,22 @@ class Expert:
     def _reachable(
         self, q: FloatArray, velocity: FloatArray, position: FloatArray, normal: FloatArray
     ) -> FloatArray:
-        """Goal configurations (m, 7), in no order.
+        """Goal configurations (m, 7), in no order; good until it is asked again.
 
         A7 alone turns the free yaw, so it is left where it comes to rest.
         """
-        a = robot.JOINT_ACCELERATION_RAD_S2[6]
-        rest = q[6] + velocity[6] * abs(velocity[6]) / (2.0 * a)
-        nearest = self._nearest_goal(q, velocity, position, normal)
-        added = [] if nearest is None else [nearest[None]]
-        family = np.concatenate([self._family, *added])
-        family[:, 6] = min(max(rest, -robot.JOINT_RANGE_RAD[6]), robot.JOINT_RANGE_RAD[6])
-        return family
+        rest = _where_braking_ends(q, velocity)
+        nearest = self._nearest_goal(rest, position, normal)
+        family = self._family
+        if nearest is None:
+            family = family[:, :-1]
+        else:
+            family[:, -1] = nearest
+        family[6] = min(max(rest[6], -robot.JOINT_RANGE_RAD[6]), robot.JOINT_RANGE_RAD[6])
+        return family.T
 
     def _nearest_goal(
-        self, q: FloatArray, velocity: FloatArray, position: FloatArray, normal: FloatArray
+        self, rest: FloatArray, position: FloatArray, normal: FloatArray
     ) -> FloatArray | None:
         """The goal configuration (7,) nearest to where the arm comes to rest, by Gauss-Newton.
 
@@ -301,11 +324,11 @@ class Expert:
         from the goal, where the family's one-degree grid is as good, or outside the joint ranges.
         """
         a = robot.JOINT_ACCELERATION_RAD_S2
-        goal = q + velocity * np.abs(velocity) / (2.0 * a)
+        goal = rest
         for iteration in range(_ITERATIONS):
             R, flange = self._kinematics.flange_pose(goal)
             away = position - flange
-            if iteration == 0 and np.linalg.norm(away) > PROJECTION_RANGE_M:
+            if iteration == 0 and math.hypot(*away.tolist()) > PROJECTION_RANGE_M:
                 return None
             # Rotation vector that takes the flange axis onto the inward normal; yaw stays free.
             across, turn = self._across, _cross(R[:, 2], -normal)
@@ -314,7 +337,7 @@ class Expert:
                 break
             jacobian = self._kinematics.jacobian(goal)
             weighted = np.concatenate([jacobian[:3], across @ jacobian[3:]]) * a
-            goal = goal + a * (np.linalg.pinv(weighted, rcond=1e-3) @ error)
+            goal = goal + a * _least_solution(weighted, error)
         else:
             return None
         if (np.abs(goal) > robot.JOINT_RANGE_RAD).any() or R[:, 2] @ normal > 0.0:
@@ -325,18 +348,22 @@ class Expert:
         self, q: FloatArray, velocity: FloatArray, goal: FloatArray, *, together: bool = True
     ) -> ruckig.Trajectory:
         """The time-optimal motion to rest at a goal, the joints arriving together or each alone."""
-        speed = robot.JOINT_SPEED_RAD_S
         # Ruckig's root finding stumbles over distances at the limit of double precision.
-        start = np.where(np.abs(q - goal) < 1e-9, goal, q)
-        moving = np.where(np.abs(velocity) < 1e-9, 0.0, np.clip(velocity, -speed, speed))
-        self._input.current_position = list(start)
-        self._input.current_velocity = list(moving)
+        ends = goal.tolist()
+        self._input.current_position = [
+            end if abs(angle - end) < 1e-9 else angle
+            for angle, end in zip(q.tolist(), ends, strict=True)
+        ]
+        self._input.current_velocity = [
+            0.0 if abs(speed) < 1e-9 else min(max(speed, -limit), limit)
+            for speed, limit in zip(velocity.tolist(), self._input.max_velocity, strict=True)
+        ]
         self._input.synchronization = (
             ruckig.Synchronization.Time if together else ruckig.Synchronization.No
         )
         trajectory = ruckig.Trajectory(7)
         for nudge in _NUDGES_RAD:
-            self._input.target_position = list(goal + nudge)
+            self._input.target_position = [end + nudge for end in ends]
             try:
                 self._ruckig.calculate(self._input, trajectory)
             except ruckig.RuckigError:
@@ -345,19 +372,31 @@ class Expert:
         raise RuntimeError(f"ruckig finds no motion from {q} at {velocity} to {goal}")
 
     def _least_clearance(self, motion: ruckig.Trajectory, required: float) -> float:
-        """Least clearance (m) along a motion; stops looking once it falls below ``required``.
+        """Least clearance (m) along a motion from the present state.
 
+        Stops looking once it falls below ``required``.
         Steps as far as the arm can get within the distance found (conservative advancement).
         """
-        least = np.inf
+        least = clearance = self._clearance_m
         t = 0.0
-        while True:
-            q = np.asarray(motion.at_time(min(t, motion.duration))[0])
+        while least >= required and t < motion.duration:
+            t += max(_PATH_STEP_S, (clearance - CLEARANCE_M) / _MAX_FLANGE_SPEED_M_S)
+            q = motion.at_time(min(t, motion.duration))[0]
             clearance = self._kinematics.clearance(q, self._floor_m)
             least = min(least, clearance)
-            if least < required or t >= motion.duration:
-                return float(least)
-            t += max(_PATH_STEP_S, (clearance - CLEARANCE_M) / _MAX_FLANGE_SPEED_M_S)
+        return least
+
+
+def _where_braking_ends(q: FloatArray, velocity: FloatArray) -> FloatArray:
+    """Where each joint comes to rest (7,) if it brakes as hard as it can."""
+    return q + velocity * np.abs(velocity) / (2.0 * robot.JOINT_ACCELERATION_RAD_S2)
+
+
+def _least_solution(A: FloatArray, b: FloatArray) -> FloatArray:
+    """The least x with A x = b as near as can be, leaving out directions that hardly count."""
+    u, s, vt = np.linalg.svd(A, full_matrices=False)
+    # ``np.linalg.pinv`` spends more on its checks than on its work.
+    return np.asarray(np.where(s > 1e-3 * s[0], (b @ u) / s, 0.0) @ vt)
 
 
 def _cross(one: FloatArray, two: FloatArray) -> FloatArray:
