@@ -163,7 +163,7 @@ def packed(
                 columns[name] = encode(pictures)
                 stats[name] = picture_stats(pictures)
         else:
-            columns[name] = numbers[name] = np.stack([frame[name] for frame in frames])
+            columns[name] = numbers[name] = np.array([frame[name] for frame in frames])
     stats |= column_stats(numbers)
     return Demonstration(
         scenario, len(frames), columns, stats, bool(info["is_success"]), bool(info["collision"])
