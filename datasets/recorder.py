@@ -114,8 +114,8 @@ def record(
 
     if resume:
         _check_same_recording(root, metadata)
+    missing = [folder for folder in (root, *root.parents) if not folder.exists()]
     prepare_root(root, resume=resume)
-    write_metadata(root, metadata)
     outcomes = published_outcomes(root)
     tracker = _Tracker(len(outcomes), sum(outcomes), episodes, progress)
     fps = round(1.0 / variant.control_period_s)
@@ -130,6 +130,9 @@ def record(
     try:
         with contextlib.closing(played):
             for demonstration in in_order(played, len(outcomes)):
+                # Not before there is something to keep: see below.
+                if tracker.frames == 0:
+                    write_metadata(root, metadata)
                 writer.save(demonstration)
                 tracker.saved(demonstration.length, demonstration.success)
         writer.publish()
@@ -146,6 +149,11 @@ def record(
             f"cannot write {root}: {error.strerror or error}; {saved} of {episodes} episodes are "
             "saved, go on with --resume"
         ) from error
+    finally:
+        # A recording that could not begin, for want of OpenGL say, leaves no trace.
+        for folder in missing:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
     return tracker.state()
 
 
@@ -173,7 +181,7 @@ class _Tracker:
         self._before = self._episodes = episodes
         self._successes = successes
         self._total = total
-        self._frames = 0
+        self.frames = 0
         self._progress = progress
         # Until the first episode is there, workers start: not part of the rate.
         self._since: float | None = None
@@ -182,7 +190,7 @@ class _Tracker:
         """Counts one episode and reports."""
         self._episodes += 1
         self._successes += success
-        self._frames += frames
+        self.frames += frames
         if self._since is None:
             self._since = time.monotonic()
         if self._progress is not None:
@@ -197,7 +205,7 @@ class _Tracker:
             episodes=self._episodes,
             total=self._total,
             successes=self._successes,
-            frames=self._frames,
+            frames=self.frames,
             episodes_per_s=rate,
             remaining_s=(self._total - self._episodes) / rate if rate > 0.0 else None,
         )

@@ -13,10 +13,11 @@ import pytest
 from frames import assert_same_frames, columns
 
 import hvs_suite
-from hvs_suite.datasets.metadata import read_metadata
+from hvs_suite.datasets.demonstration import MakeEnvironment
+from hvs_suite.datasets.metadata import METADATA_FILE, read_metadata
 from hvs_suite.datasets.recorder import record
 from hvs_suite.datasets.writer import STAGE
-from hvs_suite.errors import DatasetError, OptionError, OutputError, ScenarioError
+from hvs_suite.errors import DatasetError, OptionError, OutputError, RenderError, ScenarioError
 
 TASK = "align-fixed"
 N = 5
@@ -231,3 +232,18 @@ def test_metadata_of_anything_else_is_refused(tmp_path):
     (tmp_path / "hvs.json").write_text('{"format": 99}')
     with pytest.raises(DatasetError, match="format"):
         read_metadata(tmp_path)
+
+
+def test_a_recording_that_cannot_begin_leaves_no_trace(tmp_path, monkeypatch):
+    def fail(self):
+        raise RenderError("no OpenGL backend works on this machine")
+
+    monkeypatch.setattr(MakeEnvironment, "__call__", fail)
+    (tmp_path / "empty").mkdir()
+    for root in (tmp_path / "new" / "dataset", tmp_path / "empty"):
+        with pytest.raises(RenderError):
+            record(TASK, N, "train", root)
+    assert [path.name for path in tmp_path.rglob("*")] == ["empty"]
+    monkeypatch.undo()
+    record(TASK, 1, "train", tmp_path / "empty")
+    assert (tmp_path / "empty" / METADATA_FILE).exists()
