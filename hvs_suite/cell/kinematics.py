@@ -130,29 +130,30 @@ class Kinematics:
             raise RuntimeError("Pinocchio read no robot from the cell's MJCF")
         self._flange = self.model.getFrameId("flange")
         self._data = self.model.createData()
-        self._add_collision_pairs()
-        self._geometry_data = self.geometry.createData()
+        self._scene = self._with_surface()
+        self._scene_data = self._scene.createData()
 
-    def _add_collision_pairs(self) -> None:
-        """Pairs up the geoms of links at least three joints apart.
+    def _with_surface(self) -> pin.GeometryModel:
+        """The robot over a surface; pairs up the geoms of links at least three joints apart.
 
         Nearer links keep a distance that their joint ranges guarantee (at least 34 mm, between the
         forearm's end and the flange), which would hide what the configuration decides.
         """
-        objects = self.geometry.geometryObjects
-        for i, first in enumerate(objects):
-            for j in range(i + 1, len(objects)):
-                if abs(first.parentJoint - objects[j].parentJoint) > 2:
-                    self.geometry.addCollisionPair(pin.CollisionPair(i, j))
-        # Base and link 1 can never come closer to the surface than they stand.
         self._surface: tuple[float, tuple[float, ...]] = 0.0, _UP
         self._half_space = coal.Halfspace(np.array(_UP), 0.0)
-        surface = self.geometry.addGeometryObject(
+        scene = self.geometry.copy()
+        surface = scene.addGeometryObject(
             pin.GeometryObject("surface", 0, pin.SE3.Identity(), self._half_space)
         )
-        for i, body in enumerate(objects):
-            if body.parentJoint >= 2:
-                self.geometry.addCollisionPair(pin.CollisionPair(i, surface))
+        bodies = list(self.geometry.geometryObjects)
+        for i, first in enumerate(bodies):
+            for j in range(i + 1, len(bodies)):
+                if abs(first.parentJoint - bodies[j].parentJoint) > 2:
+                    scene.addCollisionPair(pin.CollisionPair(i, j))
+            # Base and link 1 can never come closer to the surface than they stand.
+            if first.parentJoint >= 2:
+                scene.addCollisionPair(pin.CollisionPair(i, surface))
+        return scene
 
     def flange_pose(self, q: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Rotation (3, 3) and position (3,) in m of the flange in the base frame."""
@@ -207,10 +208,8 @@ class Kinematics:
             normal = np.asarray(surface_normal, dtype=np.float64)
             self._half_space.n, self._half_space.d = normal, surface_height_m * normal[2]
         q = np.asarray(q, dtype=np.float64)
-        nearest = pin.computeDistances(
-            self.model, self._data, self.geometry, self._geometry_data, q
-        )
-        return float(self._geometry_data.distanceResults[nearest].min_distance)
+        nearest = pin.computeDistances(self.model, self._data, self._scene, self._scene_data, q)
+        return float(self._scene_data.distanceResults[nearest].min_distance)
 
     def inverse_kinematics(
         self,
