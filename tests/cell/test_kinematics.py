@@ -6,7 +6,7 @@ import numpy.typing as npt
 import pytest
 
 from hvs_suite.cell import robot
-from hvs_suite.cell.kinematics import kinematics, tool_frame, travel_time
+from hvs_suite.cell.kinematics import Kinematics, kinematics, tool_frame, travel_time
 
 FloatArray = npt.NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])
@@ -153,6 +153,22 @@ def test_the_default_grids_are_within_two_percent_of_the_fastest_way() -> None:
             for n in (1440, 72)
         )
         assert usual <= 1.02 * dense
+
+
+def test_clearance_is_the_least_of_all_distances_wherever_the_arm_is() -> None:
+    """It measures simpler bodies first; this measures every pair as it is."""
+    import pinocchio as pin
+
+    model = Kinematics()
+    scene = model._scene
+    data = scene.createData()
+    random = np.random.default_rng(3)
+    for height, normal in ((0.0, (0.0, 0.0, 1.0)), (-0.1, (0.28, 0.0, 0.96))):
+        for q in random.uniform(-robot.JOINT_RANGE_RAD, robot.JOINT_RANGE_RAD, (200, 7)):
+            clearance = model.clearance(q, height, normal)
+            pin.computeDistances(model.model, model._data, scene, data, q)
+            least = min(result.min_distance for result in data.distanceResults)
+            assert clearance == pytest.approx(least, abs=1e-5)
 
 
 def test_clearance_over_a_surface_is_the_standoff_where_the_flange_is_lowest() -> None:
