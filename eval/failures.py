@@ -21,8 +21,10 @@ from hvs_suite import registry
 from hvs_suite.errors import ResultError
 from hvs_suite.eval import action_log, result_file
 from hvs_suite.eval.result_file import EpisodeRow
+from hvs_suite.eval.trial import tolerances
 from hvs_suite.policies.checkpoint import load_network, network_inputs, read_config
 from hvs_suite.rollout import Action, Observation, one_torch_thread
+from hvs_suite.tasks.variants import AlignVariant
 
 if TYPE_CHECKING:
     from hvs_suite.cell.environment import Environment
@@ -176,7 +178,7 @@ def _sort(
     off_mm = None if estimate is None else 1e3 * float(np.linalg.norm((estimate - target)[:2]))
     return Failure(
         scenario=row.scenario,
-        cause=_cause(row, env, seen, off_mm, errors_mm),
+        cause=cause_of(row, env.variant, seen, off_mm, errors_mm),
         steps=row.steps,
         position_error_mm=row.position_error_mm,
         tilt_error_deg=row.tilt_error_deg,
@@ -186,22 +188,33 @@ def _sort(
     )
 
 
-def _cause(
+def cause_of(
     row: EpisodeRow,
-    env: "Environment",
-    seen: int,
-    off_mm: float | None,
+    variant: AlignVariant,
+    seen_steps: int,
+    estimate_error_mm: float | None,
     errors_mm: Sequence[float],
 ) -> Cause:
-    variant = env.variant
-    tolerance_mm = variant.position_tolerance_mm or variant.lateral_tolerance_mm
+    """Why a scenario was lost.
+
+    Args:
+        row: Its outcome.
+        variant: The task's parameters.
+        seen_steps: As in `Failure`.
+        estimate_error_mm: As in `Failure`.
+        errors_mm: Position error at the start and after every step (mm).
+    """
+    bounds = tolerances(variant)
+    tolerance_mm = next(
+        bounds[name] for name in ("position_error_mm", "lateral_error_mm") if name in bounds
+    )
     if row.failure is not None:
         return Cause.BROKEN
     if row.collision:
         return Cause.COLLIDED
-    if not seen:
+    if not seen_steps:
         return Cause.NOT_SEEN
-    if off_mm is not None and off_mm > tolerance_mm:
+    if estimate_error_mm is not None and estimate_error_mm > tolerance_mm:
         return Cause.MISPLACED
     if errors_mm[-1] < _FALLING * errors_mm[-1 - min(_LAST_STEPS, len(errors_mm) - 1)]:
         return Cause.SLOW

@@ -55,27 +55,11 @@ def hangs(context: PolicyContext) -> Holds:
     return Holds(wait)
 
 
-class Leans:
-    """Leans over at full speed after some steps."""
-
-    def __init__(self, after: int) -> None:
-        self._after = after
-
-    def reset(self) -> None:
-        self._step = 0
-
-    def select_action(self, observation: Any) -> Any:
-        self._step += 1
-        down = self._step > self._after
-        return np.array([0.0, 0.98 * down, 0.0, 0.0, 0.0, 0.0, 0.0], np.float32)
-
-
-def dives(context: PolicyContext) -> Leans:
-    return Leans(0)
-
-
-def starts_late(context: PolicyContext) -> Leans:
-    return Leans(11)
+def dives(context: PolicyContext) -> Holds:
+    """Leans over until it hits the ground."""
+    policy = still(context)
+    policy.select_action = lambda observation: np.array([0.0, 0.98, 0.0, 0.0, 0.0, 0.0, 0.0])
+    return policy
 
 
 def draws(context: PolicyContext) -> Holds:
