@@ -1,4 +1,4 @@
-"""Shipped weights: they are the ones that were scored, they play, and their card says how they do."""
+"""Shipped weights are the ones that were scored, they play, and their card says how they do."""
 
 from pathlib import Path
 
