@@ -7,7 +7,7 @@ that both ways give the same action. Anything else goes through LeRobot.
 
 import dataclasses
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -106,21 +106,54 @@ class CheckpointPolicy:
             (7,) float32.
         """
         with one_torch_thread(), torch.inference_mode():
-            action = self._decide(self._batch(observation))
+            action = self._decide(as_batch(observation, self._inputs))
         return np.array(action.reshape(-1).cpu().numpy(), np.float32)
 
-    def _batch(self, observation: Observation) -> dict[str, Tensor]:
-        """LeRobot's names and ranges, without a batch dimension."""
-        batch: dict[str, Tensor] = {}
-        for key in self._inputs:
-            if key.startswith(IMAGE_PREFIX):
-                image = torch.from_numpy(observation[key.removeprefix(IMAGE_PREFIX)])
-                batch[key] = image.permute(2, 0, 1).to(torch.float32) / 255.0
-        parts = ["joint_positions", "joint_velocities"]
-        joints = [observation[name] for name in parts if name in observation]
-        if STATE in self._inputs:
-            batch[STATE] = torch.from_numpy(np.concatenate(joints).astype(np.float32))
-        return batch
+
+def as_batch(observation: Observation, keys: Iterable[str]) -> dict[str, Tensor]:
+    """An observation of the environment under LeRobot's names and in its ranges.
+
+    Args:
+        observation: As in `CheckpointPolicy.select_action`.
+        keys: What is read of it: ``observation.images.<camera>`` and ``observation.state``.
+
+    Returns:
+        Images (C, H, W) in [0, 1] and the state (14,) or (7,), float32, no batch dimension.
+    """
+    batch: dict[str, Tensor] = {}
+    for key in keys:
+        if key.startswith(IMAGE_PREFIX):
+            image = torch.from_numpy(observation[key.removeprefix(IMAGE_PREFIX)])
+            batch[key] = image.permute(2, 0, 1).to(torch.float32) / 255.0
+        elif key == STATE:
+            parts = ["joint_positions", "joint_velocities"]
+            joints = [observation[name] for name in parts if name in observation]
+            batch[key] = torch.from_numpy(np.concatenate(joints).astype(np.float32))
+    return batch
+
+
+def network_inputs(
+    network: HvsNetwork, observation: Observation
+) -> tuple[dict[str, Tensor], Tensor | None]:
+    """An observation as `HvsNetwork.forward` takes it, a batch of one.
+
+    Args:
+        network: Its shape says what it reads.
+        observation: As in `CheckpointPolicy.select_action`.
+
+    Returns:
+        Images by camera, and the state.
+    """
+    shape = network.shape
+    keys = [IMAGE_PREFIX + name for name in shape.cameras] + [STATE] * bool(shape.state_dim)
+    return _one(network, as_batch(observation, keys))
+
+
+def _one(
+    network: HvsNetwork, batch: Mapping[str, Tensor]
+) -> tuple[dict[str, Tensor], Tensor | None]:
+    images = {name: batch[IMAGE_PREFIX + name][None] for name in network.shape.cameras}
+    return images, batch[STATE][None] if network.shape.state_dim else None
 
 
 def read_config(folder: Path) -> dict[str, Any]:
@@ -234,13 +267,11 @@ def load_network(folder: Path, config: Mapping[str, Any]) -> HvsNetwork:
 def _network(folder: Path, config: Mapping[str, Any]) -> tuple[Decide, Callable[[], None]]:
     """Play the network of an `hvs` checkpoint by itself."""
     network = load_network(folder, config)
-    shape = network.shape
     memory: Tensor | None = None
 
     def decide(batch: dict[str, Tensor]) -> Tensor:
         nonlocal memory
-        images = {name: batch[IMAGE_PREFIX + name][None] for name in shape.cameras}
-        state = batch[STATE][None] if shape.state_dim else None
+        images, state = _one(network, batch)
         decision = network(images, state, memory)
         memory = decision.memory
         return network.to_action(decision.out, state)

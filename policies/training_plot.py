@@ -20,6 +20,7 @@ PARTS = {
     "eih_loss": "eye in hand",
     "eth_loss": "eye to hand",
     "target_loss": "place of the target",
+    "flange_loss": "where the flange goes",
 }
 Curve = tuple[Any, Any]
 

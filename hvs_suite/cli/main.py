@@ -35,6 +35,7 @@ COMMANDS = {
     "serve": "hvs_suite.cli.serve:Serve",
     "verify": "hvs_suite.cli.verify:Verify",
     "compare": "hvs_suite.cli.compare:Compare",
+    "failures": "hvs_suite.cli.failures:Failures",
     "import-lerobot": "hvs_suite.cli.import_lerobot:ImportLerobot",
     "leaderboard": "hvs_suite.cli.leaderboard:Leaderboard",
     "bench": "hvs_suite.cli.bench:Bench",

@@ -16,6 +16,7 @@ from hvs_suite.policies.hvs.network import (
     MEMORY,
     HvsNetwork,
     action_loss,
+    flange_loss,
     sighting_loss,
     target_loss,
 )
@@ -99,6 +100,17 @@ class HvsPolicy(PreTrainedPolicy):
             part = target_loss(target, truth, self.config.error_scale)
             parts["target_loss"] = part.detach()
             loss = loss + 0.1 * weight * part
+            if decision.motion is not None:
+                astray = self.network.to_step(out) - self.network.to_step(label)
+                distance = batch[GOAL_POSITION] - decision.motion.position
+                part = flange_loss(
+                    astray,
+                    decision.motion,
+                    distance.norm(dim=1, keepdim=True),
+                    self.config.error_scale,
+                )
+                parts["flange_loss"] = part.detach()
+                loss = loss + 0.3 * part
         if self.training and weight > 0 and not supervised and not self._warned:
             logger.warning(
                 "training without keypoint supervision: the batch has no `privileged.target_*`"

@@ -122,12 +122,14 @@ class Decision:
         sightings: Camera name to what it saw.
         target: Where the target is taken to be, (B, 3) m in the base frame; None without joints.
         memory: What to remember for the next observation, (B, 4); None without joints.
+        motion: Where the flange is, by the measured joints; None without them.
     """
 
     out: Tensor
     sightings: dict[str, Sighting]
     target: Tensor | None
     memory: Tensor | None
+    motion: geometry.FlangeMotion | None
 
 
 def strides(side: int) -> tuple[int, ...]:
@@ -347,7 +349,8 @@ class HvsNetwork(nn.Module):
         sightings = self.look(images)
         features = [s.features() for s in sightings.values()]
         if state is None:
-            return Decision(self.head(torch.cat(features, dim=1)), sightings, None, None)
+            out = self.head(torch.cat(features, dim=1))
+            return Decision(out, sightings, None, None, None)
         q = state[:, :N_JOINTS]
         if memory is None:
             memory = state.new_zeros(len(state), MEMORY_SIZE)
@@ -371,7 +374,7 @@ class HvsNetwork(nn.Module):
             in_flange = (offset[:, None] @ motion.rotation)[:, 0]
             features += [offset, torch.asinh(in_flange / scale), estimate[:, 3:]]
         out = self.head(torch.cat(features, dim=1)) + self.step_gain * step
-        return Decision(out, sightings, target, remembered)
+        return Decision(out, sightings, target, remembered, motion)
 
     def _place(
         self, motion: geometry.FlangeMotion, sightings: Mapping[str, Sighting], memory: Tensor
@@ -424,11 +427,14 @@ class HvsNetwork(nn.Module):
         """
         if state is None:
             return out.clamp(-1.0, 1.0)
+        target = state[:, :N_JOINTS] + self.to_step(out)
+        return (target / self.joint_range).clamp(-1.0, 1.0)
+
+    def to_step(self, out: Tensor) -> Tensor:
+        """Joint step that the head's output stands for, both (B, 7), rad."""
         # A step of more than a radian helps no control period.
         bound = math.asinh(1.0 / self.shape.error_scale)
-        step = self.shape.error_scale * torch.sinh(out.clamp(-bound, bound))
-        target = state[:, :N_JOINTS] + step
-        return (target / self.joint_range).clamp(-1.0, 1.0)
+        return self.shape.error_scale * torch.sinh(out.clamp(-bound, bound))
 
     def encode_label(self, action: Tensor, state: Tensor | None) -> Tensor:
         """Inverse of `to_action` without the clipping: what the head should have said.
@@ -449,6 +455,31 @@ class HvsNetwork(nn.Module):
 def action_loss(out: Tensor, label: Tensor) -> Tensor:
     """Huber loss between the head's output and the encoded label, both (B, 7)."""
     return F.smooth_l1_loss(out, label, beta=0.3)
+
+
+def flange_loss(
+    error: Tensor, motion: geometry.FlangeMotion, distance: Tensor, error_scale: float
+) -> Tensor:
+    """Loss of where a joint step brings the flange, against the way that is left to go.
+
+    Joint by joint, a tenth too much of a fast step is a small error. But the arm comes down on the
+    target in steps of a decimetre, one joint against another, and what counts is how far the flange
+    goes astray compared with how far it still has to go.
+
+    Args:
+        error: Joint step minus the expert's, (B, 7) rad.
+        motion: Where the flange is.
+        distance: From flange to goal, (B, 1) m.
+        error_scale: Of the network; a twenty-fifth of it counts even at the goal.
+
+    Returns:
+        Scalar, logarithmic.
+    """
+    astray = (motion.jacobian @ error[:, :, None])[:, :, 0]
+    # Angles weigh like the offsets they cause half a link away.
+    astray = torch.cat([astray[:, :3], 0.2 * astray[:, 3:]], dim=1)
+    scale = 0.04 * error_scale + 0.1 * distance
+    return torch.asinh(astray.norm(dim=1, keepdim=True) / scale).mean()
 
 
 def target_loss(target: Tensor, truth: Tensor, error_scale: float) -> Tensor:

@@ -55,6 +55,13 @@ def hangs(context: PolicyContext) -> Holds:
     return Holds(wait)
 
 
+def dives(context: PolicyContext) -> Holds:
+    """Leans over until it hits the ground."""
+    policy = still(context)
+    policy.select_action = lambda observation: np.array([0.0, 0.98, 0.0, 0.0, 0.0, 0.0, 0.0])
+    return policy
+
+
 def draws(context: PolicyContext) -> Holds:
     """Draws from the global generator, as other people's policies do."""
     policy = still(context)

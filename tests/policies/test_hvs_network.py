@@ -15,6 +15,7 @@ from hvs_suite.policies.hvs.network import (
     HvsNetwork,
     Shape,
     action_loss,
+    flange_loss,
     sighting_loss,
     strides,
 )
@@ -86,6 +87,17 @@ def test_calibration_finds_the_cameras_that_made_the_data():
     np.testing.assert_allclose(found.homography, homography, atol=1e-6)
     assert found.plane_height_m == pytest.approx(0.0)
     assert found.size_at_1m == pytest.approx(0.04)
+
+
+def test_going_astray_costs_more_the_nearer_the_goal_and_nothing_where_the_arm_only_swivels():
+    motion = geometry.flange_motion(torch.tensor([[0.3, 0.9, 0.1, -0.8, 0.2, 1.0, 0.0]]))
+    error = torch.full((1, 7), 0.01)
+    losses = [flange_loss(error, motion, torch.tensor([[d]]), 0.005) for d in (0.5, 0.05, 0.0)]
+    assert losses[0] < losses[1] < losses[2]
+    # The motion that keeps the flange where it is: the null space of the Jacobian.
+    swivel = torch.linalg.svd(motion.jacobian)[2][:, -1]
+    still = flange_loss(0.1 * swivel, motion, torch.tensor([[0.0]]), 0.005)
+    assert still < 0.01 < losses[0]
 
 
 @pytest.mark.parametrize("state_dim", [0, 7, 14])

@@ -62,7 +62,7 @@ def test_actions_do_not_depend_on_privileged_keys(policy, batch):
 
 def test_the_loss_uses_privileged_keys_where_they_are_and_warns_where_not(policy, batch, caplog):
     loss, parts = policy.forward(batch)
-    assert set(parts) == {"action_loss", "eih_loss", "eth_loss", "target_loss"}
+    assert set(parts) == {"action_loss", "eih_loss", "eth_loss", "target_loss", "flange_loss"}
     assert all(isinstance(value, float) for value in parts.values())
     policy.train()
     public = {k: v for k, v in batch.items() if not k.startswith("privileged.")}

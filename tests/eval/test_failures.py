@@ -1,0 +1,74 @@
+"""Why policies fail: each kind of failure is told from the others."""
+
+import pytest
+from test_result_file import row
+
+import hvs_suite
+from hvs_suite.cli.main import run
+from hvs_suite.eval import protocol
+from hvs_suite.eval.failures import Cause, cause_of, markdown, sort_failures
+
+TASK = "align-easy"
+
+
+def played(policy, tmp_path, episodes=8):
+    path = tmp_path / "result.json"
+    protocol.evaluate(policy, TASK, path, split="dev", episodes=episodes)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("policy", "cause"),
+    [
+        ("broken_policies:raises", Cause.BROKEN),
+        ("broken_policies:dives", Cause.COLLIDED),
+        ("zero", Cause.CONTROLLED),
+    ],
+)
+def test_a_failure_has_its_cause(policy, cause, tmp_path):
+    report = sort_failures(played(policy, tmp_path))
+    assert len(report.failures) == report.n_episodes == 8
+    # Standing upright, the arm may hide the target all the time.
+    assert {f.cause for f in report.failures} <= {cause, Cause.NOT_SEEN}
+    assert report.of(cause)
+    assert all(f.seen_steps == 0 for f in report.of(Cause.NOT_SEEN))
+    text = markdown([report])
+    assert f"| {cause} |" in text
+    assert "8 of 8 lost" in text
+
+
+@pytest.mark.parametrize(
+    ("estimate_mm", "errors_mm", "cause"),
+    [
+        (7.0, [900.0, 30.0, 8.0, 7.0, 7.0], Cause.MISPLACED),
+        (0.5, [900.0, 90.0, 60.0, 30.0, 9.0], Cause.SLOW),
+        (0.5, [900.0, 9.0, 9.0, 9.0, 9.0], Cause.CONTROLLED),
+        (None, [900.0, 90.0], Cause.SLOW),
+    ],
+)
+def test_an_estimate_and_the_last_steps_tell_eye_from_hand(estimate_mm, errors_mm, cause):
+    lost = row(0, success=False, error=errors_mm[-1])
+    assert cause_of(lost, hvs_suite.TASKS[TASK], 3, estimate_mm, errors_mm) is cause
+
+
+def test_what_was_solved_is_no_failure(tmp_path):
+    report = sort_failures(played("expert", tmp_path, episodes=1))
+    assert report.failures == ()
+    assert "0 of 1 lost" in markdown([report])
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        ([], "at least one"),
+        (["{result}", "--pictures", "-1"], "--pictures"),
+        (["{result}", "--policy", "servo"], "no network"),
+        (["{result}.none"], "none"),
+    ],
+)
+def test_mistakes_are_one_line(words, reason, tmp_path, capsys):
+    result = played("zero", tmp_path, episodes=1)
+    assert run(["failures", *(word.format(result=result) for word in words)]) == 2
+    complaint = capsys.readouterr().err
+    assert reason in complaint
+    assert len(complaint.splitlines()) == 1

@@ -1,0 +1,43 @@
+"""Shipped weights are the ones that were scored, they play, and their card says how they do."""
+
+from pathlib import Path
+
+import pytest
+
+import hvs_suite
+from hvs_suite.eval import provenance, result_file
+from hvs_suite.policies import catalogue
+from hvs_suite.policies.recipe import trained_on
+from hvs_suite.rollout import rollout
+
+ROOM = Path(catalogue.HERE)
+RESULTS = Path(__file__).parents[2] / "eval" / "results"
+TASKS = [task for task in hvs_suite.TASKS if (ROOM / "pretrained" / trained_on(task)).is_dir()]
+
+
+class Load:
+    """Loads a task in whichever process asks for it."""
+
+    def __init__(self, task: str) -> None:
+        self.task = task
+
+    def __call__(self):
+        return hvs_suite.load(self.task, split="dev")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_shipped_weights_solve_scenes_that_nobody_trained_on(task):
+    make = catalogue.policy_factory("pretrained", task)
+    episodes = rollout(Load(task), make, range(5))
+    assert sum(episode.success for episode in episodes) >= 4
+    assert not any(episode.collision for episode in episodes)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_board_and_the_card_speak_of_these_weights(task):
+    folder = ROOM / "pretrained" / trained_on(task)
+    result = result_file.load(RESULTS / "pretrained" / f"{task}.json")
+    assert result.metadata.policy_hash == provenance.checkpoint_hash(folder)
+    summary = result.summary
+    row = f"| `{task}` | `test` | {summary.n_success:,} of {summary.n_episodes:,}"
+    assert row in (folder / "README.md").read_text()
