@@ -67,17 +67,17 @@ def merge_stats(parts: Sequence[FeatureStats]) -> FeatureStats:
     return FeatureStats(int(counts.sum()), merged)
 
 
-def column_stats(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, FeatureStats]:
+def column_stats[Name](columns: Mapping[Name, npt.NDArray[Any]]) -> dict[Name, FeatureStats]:
     """Statistics of columns of numbers.
 
     Args:
-        columns: Feature to values (n,) or (n, k).
+        columns: Feature to values (n,) or (n, k), n the same for all.
 
     Returns:
         Feature to statistics, in the order given.
     """
-    stats: dict[str, FeatureStats] = {}
-    grouped: dict[np.dtype[Any], dict[str, npt.NDArray[Any]]] = {}
+    stats: dict[Name, FeatureStats] = {}
+    grouped: dict[np.dtype[Any], dict[Name, npt.NDArray[Any]]] = {}
     for name, column in columns.items():
         values = column.reshape(len(column), -1)
         # Columns of a type go through NumPy together: a call costs more than their few numbers.

@@ -10,10 +10,11 @@ import dataclasses
 import json
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy.typing as npt
 import pyarrow.parquet as pq
 
 from hvs_suite.datasets import lerobot_files as files
@@ -47,6 +48,25 @@ class _Published:
     data_files: int = 0
     episode_files: int = 0
     stats: Mapping[str, FeatureStats] = dataclasses.field(default_factory=dict)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Episode:
+    """What is to be said of an episode whose frames are written.
+
+    Attributes:
+        first: Index of its first frame in the dataset.
+        length: Its frames.
+        data_file: Number of its data file.
+        counters: The columns that LeRobot adds.
+        stats: Statistics of all other columns.
+    """
+
+    first: int
+    length: int
+    data_file: int
+    counters: Mapping[str, npt.NDArray[Any]]
+    stats: Mapping[str, FeatureStats]
 
 
 class DatasetWriter:
@@ -91,40 +111,49 @@ class DatasetWriter:
             self._open = _Block(self._published.data_files)
         block, before = self._open, self._published
         length, first = demonstration.length, before.frames + block.frames
-        episode = before.episodes + len(block.rows)
+        episode = before.episodes + len(block.episodes)
         counters = files.counters(length, episode, first, self._fps)
-        stats = {**demonstration.stats, **column_stats(counters)}
         table = files.data_table(self._schema, {**demonstration.columns, **counters})
         # An interrupt in here would leave rows that are not listed.
         block.torn = True
         block.write(self._stage, table)
-        named = files.named_stats(self._features, stats)
-        block.rows.append(
-            files.episode_row(episode, length, first, block.data_file, self._task, named)
+        block.episodes.append(
+            _Episode(first, length, block.data_file, counters, demonstration.stats)
         )
-        block.stats.append(stats)
         block.frames += length
         block.torn = False
-        if len(block.rows) >= self._block:
+        if len(block.episodes) >= self._block:
             self.publish()
 
     def publish(self) -> None:
         """Closes the open block, if any, and moves it into place."""
         block, before = self._open, self._published
-        if block is None or before is None or block.torn or not block.rows:
+        if block is None or before is None or block.torn or not block.episodes:
             self.discard()
             return
         block.close()
         names = files.with_counters(self._features)
-        parts = [before.stats, *block.stats] if before.stats else block.stats
+        stats = _stats_of_block(block.episodes)
+        parts = [before.stats, *stats] if before.stats else stats
+        rows = [
+            files.episode_row(
+                before.episodes + i,
+                episode.length,
+                episode.first,
+                episode.data_file,
+                self._task,
+                files.named_stats(self._features, stats[i]),
+            )
+            for i, episode in enumerate(block.episodes)
+        ]
         after = _Published(
-            before.episodes + len(block.rows),
+            before.episodes + len(rows),
             before.frames + block.frames,
             block.data_file + 1,
             before.episode_files + 1,
             {name: merge_stats([part[name] for part in parts]) for name in names},
         )
-        files.write_episodes(self._stage, before.episode_files, block.rows)
+        files.write_episodes(self._stage, before.episode_files, rows)
         files.write_task(self._stage, self._task)
         files.write_stats(self._stage, self._features, after.stats)
         files.write_info(
@@ -159,8 +188,7 @@ class _Block:
 
     def __init__(self, data_file: int) -> None:
         self.data_file = data_file
-        self.rows: list[dict[str, Any]] = []
-        self.stats: list[Mapping[str, FeatureStats]] = []
+        self.episodes: list[_Episode] = []
         self.frames = 0
         self.torn = False
         self._writer: pq.ParquetWriter | None = None
@@ -186,6 +214,20 @@ class _Block:
         writer, self._writer = self._writer, None
         if writer is not None:
             writer.close()
+
+
+def _stats_of_block(episodes: Sequence[_Episode]) -> list[dict[str, FeatureStats]]:
+    """Statistics of all columns, episode by episode."""
+    stats = [dict(episode.stats) for episode in episodes]
+    alike: dict[int, list[int]] = {}
+    for i, episode in enumerate(episodes):
+        alike.setdefault(episode.length, []).append(i)
+    # Counters of episodes of one length go through NumPy together.
+    for members in alike.values():
+        together = {(i, name): c for i in members for name, c in episodes[i].counters.items()}
+        for (i, name), counted in column_stats(together).items():
+            stats[i][name] = counted
+    return stats
 
 
 def _read_published(root: Path, features: Mapping[str, dict[str, Any]]) -> _Published:

@@ -228,7 +228,7 @@ def test_what_was_torn_by_an_interrupt_is_dropped(features, episodes, tmp_path, 
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(lerobot_files, "episode_row", interrupt)
+        patched.setattr(writer, "_Episode", interrupt)
         with pytest.raises(KeyboardInterrupt):
             files.save(packed(1, episodes[1], features, OUTCOME))
     files.publish()
