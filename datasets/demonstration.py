@@ -17,6 +17,7 @@ import numpy.typing as npt
 from hvs_suite.cell.robot import JOINT_RANGE_RAD
 from hvs_suite.datasets.episode_stats import FeatureStats, column_stats, picture_stats
 from hvs_suite.datasets.features import Frame, acted_part, dataset_features, observed_part
+from hvs_suite.datasets.png import encode
 from hvs_suite.registry import load
 from hvs_suite.rollout import Policy
 
@@ -30,18 +31,6 @@ NOISE_FULL_DISTANCE_M = 0.2
 """Distance to the goal from which on the perturbation has its full size (m)."""
 NOISE_FLOOR = 0.02
 """Share of it that is left at the goal, so that the last millimetres are demonstrated as well."""
-
-
-# Of all lossless settings these are the fastest on the cell's pictures; level 6 of other filters
-# takes five times as long to save a quarter of the bytes.
-_PNG = (
-    cv2.IMWRITE_PNG_COMPRESSION,
-    1,
-    cv2.IMWRITE_PNG_STRATEGY,
-    cv2.IMWRITE_PNG_STRATEGY_RLE,
-    cv2.IMWRITE_PNG_FILTER,
-    cv2.IMWRITE_PNG_FILTER_UP,
-)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,17 +52,6 @@ class Demonstration:
     stats: dict[str, FeatureStats]
     success: bool
     collision: bool
-
-
-def encode(pictures: Sequence[npt.NDArray[np.uint8]]) -> list[bytes]:
-    """Pictures, RGB uint8 (H, W, 3) and all alike in shape, as PNG files."""
-    # One buffer for all: touching fresh memory takes longer than swapping the channels.
-    swapped = np.empty_like(pictures[0])
-    files = []
-    for picture in pictures:
-        cv2.cvtColor(picture, cv2.COLOR_RGB2BGR, swapped)
-        files.append(cv2.imencode(".png", swapped, _PNG)[1].tobytes())
-    return files
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,6 +86,8 @@ class Demonstrate:
 
     def __call__(self, env: "Environment", expert: Policy, scenario: int) -> Demonstration:
         """Plays one scenario to its end."""
+        # A frame holds what was seen before its control step, so none holds what the last shows.
+        env.observes_end = False
         time_step = env.reset(scenario=scenario)
         expert.reset()
         perturbation = _Perturbation(env, scenario, self.noise) if self.noise > 0.0 else None
@@ -155,16 +135,15 @@ def packed(
     """
     columns: dict[str, npt.NDArray[Any] | list[bytes]] = {}
     numbers: dict[str, npt.NDArray[Any]] = {}
-    stats: dict[str, FeatureStats] = {}
+    pictures: dict[str, list[npt.NDArray[np.uint8]]] = {}
     for name, feature in features.items():
         if feature["dtype"] == "image":
-            pictures = [frame[name] for frame in frames]
-            with _one_thread():
-                columns[name] = encode(pictures)
-                stats[name] = picture_stats(pictures)
+            pictures[name] = [frame[name] for frame in frames]
+            columns[name] = encode(pictures[name])
         else:
             columns[name] = numbers[name] = np.array([frame[name] for frame in frames])
-    stats |= column_stats(numbers)
+    with _one_thread():
+        stats = {**picture_stats(pictures), **column_stats(numbers)}
     return Demonstration(
         scenario, len(frames), columns, stats, bool(info["is_success"]), bool(info["collision"])
     )

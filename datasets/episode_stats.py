@@ -91,24 +91,29 @@ def column_stats(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, FeatureSt
     return {name: stats[name] for name in columns}
 
 
-def picture_stats(pictures: Sequence[npt.NDArray[np.uint8]]) -> FeatureStats:
+def picture_stats(
+    features: Mapping[str, Sequence[npt.NDArray[np.uint8]]],
+) -> dict[str, FeatureStats]:
     """Statistics by channel, in [0, 1], of the pixels that LeRobot samples.
 
     Args:
-        pictures: uint8 (H, W, C) each, all alike in shape.
+        features: Feature to pictures, uint8 (H, W, C) each, all of a feature alike in shape.
+
+    Returns:
+        Feature to statistics, in the order given.
     """
-    chosen = sampled_pictures(pictures)
-    n, height, _, channels = chosen.shape
-    total, squares = _sums(chosen)
-    pixels = np.float32(chosen[..., 0].size)
-    mean = total / pixels
-    variance = squares / pixels - mean**2
-    flat = np.ascontiguousarray(chosen.reshape(n * height, -1, channels))
-    histograms = [cv2.calcHist([flat], [c], None, [256], [0, 256]) for c in range(channels)]
-    counts = np.concatenate(histograms, axis=1).astype(np.int64)
+    if not features:
+        return {}
+    chosen = {name: sampled_pictures(pictures) for name, pictures in features.items()}
+    parts = [_sums_and_counts(pictures) for pictures in chosen.values()]
+    # From here on channels of all features go through NumPy together, as columns do.
+    total, squares, counts = (np.concatenate(part, axis=-1) for part in zip(*parts, strict=True))
     low = (counts > 0).argmax(axis=0).astype(np.float32)
     high = 255 - (counts[::-1] > 0).argmax(axis=0).astype(np.float32)
     upto = np.cumsum(counts, axis=0)
+    pixels = upto[-1].astype(np.float32)
+    mean = total / pixels
+    variance = squares / pixels - mean**2
     wanted = np.array(QUANTILES)[:, None] * upto[-1]
     # A shade has a bin to itself, so the quantile's shade alone decides.
     shades = (upto < wanted[:, None]).sum(axis=1)
@@ -119,7 +124,22 @@ def picture_stats(pictures: Sequence[npt.NDArray[np.uint8]]) -> FeatureStats:
     # LeRobot divides the first four in float32, quantiles in float64.
     first = np.stack([low, high, mean, np.sqrt(np.maximum(variance, np.float32(0.0)))])
     values = np.concatenate([first / np.float32(255.0), quantiles / 255.0])
-    return FeatureStats(n, values)
+    ends = np.cumsum([pictures.shape[-1] for pictures in chosen.values()])
+    split = np.split(values, ends[:-1], axis=1)
+    return {
+        name: FeatureStats(len(pictures), part)
+        for (name, pictures), part in zip(chosen.items(), split, strict=True)
+    }
+
+
+def _sums_and_counts(
+    pictures: npt.NDArray[np.uint8],
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.int64]]:
+    """Of pictures (n, h, w, c): sums (c,), of squares too, and pixels of each shade (256, c)."""
+    n, height, _, channels = pictures.shape
+    flat = np.ascontiguousarray(pictures.reshape(n * height, -1, channels))
+    histograms = [cv2.calcHist([flat], [c], None, [256], [0, 256]) for c in range(channels)]
+    return *_sums(pictures), np.concatenate(histograms, axis=1).astype(np.int64)
 
 
 def _sums(

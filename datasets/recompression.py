@@ -13,10 +13,11 @@ from typing import Any
 import pyarrow as pa
 
 from hvs_suite.datasets import lerobot_files, reader
-from hvs_suite.datasets.demonstration import Demonstration, encode
-from hvs_suite.datasets.episode_stats import FeatureStats, column_stats, picture_stats
+from hvs_suite.datasets.demonstration import Demonstration
+from hvs_suite.datasets.episode_stats import column_stats, picture_stats
 from hvs_suite.datasets.features import SCENARIO
 from hvs_suite.datasets.metadata import METADATA_FILE
+from hvs_suite.datasets.png import encode
 from hvs_suite.datasets.reader import Picture, Place
 from hvs_suite.datasets.writer import DatasetWriter
 from hvs_suite.errors import DatasetError
@@ -103,10 +104,7 @@ def _demonstration(
         if name not in pictures
     }
     images: dict[str, list[bytes]] = {name: encode(each) for name, each in pictures.items()}
-    stats: dict[str, FeatureStats] = {
-        **column_stats(numbers),
-        **{name: picture_stats(each) for name, each in pictures.items()},
-    }
+    stats = {**column_stats(numbers), **picture_stats(pictures)}
     return Demonstration(
         scenario=int(numbers[SCENARIO].ravel()[0]),
         length=table.num_rows,

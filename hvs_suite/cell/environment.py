@@ -77,6 +77,8 @@ class Environment(composer.Environment):
         clip_actions: Clip and count action values outside [-1, 1] instead of refusing them.
         goal_ends_episode: False lets an episode go on past its goal to the time limit, so that one
             can see where a policy settles. Never changes a scene.
+        observes_end: False leaves the observation of an episode's last time step empty, for those
+            who look only at what they act on. Never changes a scene.
 
     Args:
         task: The task.
@@ -86,6 +88,7 @@ class Environment(composer.Environment):
     def __init__(self, task: ServoTask, seed: int | None = None) -> None:
         self.clip_actions = False
         self.goal_ends_episode = True
+        self.observes_end = True
         self._physics: Any = None
         self._renderer: Renderer | None = None
         self._studio: dict[int, Renderer] = {}
@@ -167,7 +170,8 @@ class Environment(composer.Environment):
         discount = task.get_discount(physics)
         self._reset_next_step = task.has_ended
         kind = dm_env.StepType.LAST if task.has_ended else dm_env.StepType.MID
-        return dm_env.TimeStep(kind, reward, discount, self._observe())
+        seen = {} if task.has_ended and not self.observes_end else self._observe()
+        return dm_env.TimeStep(kind, reward, discount, seen)
 
     def observation_spec(self) -> dict[str, specs.Array]:
         """Shapes, types and bounds of the observations, known without drawing anything."""

@@ -200,6 +200,21 @@ def test_a_reset_rebuilds_nothing_and_each_camera_is_drawn_once_a_step(
             assert drawn == 2 * cameras
 
 
+def test_what_the_last_step_shows_can_be_left_out_and_nothing_else_changes() -> None:
+    with hvs_suite.load("align-thesis", time_limit_steps=3) as env:
+        whole = [env.reset(scenario=0), *(env.step(wander(env, i)) for i in range(3))]
+        env.observes_end = False
+        spared = [env.reset(scenario=0), *(env.step(wander(env, i)) for i in range(3))]
+        assert env.reset(scenario=1).observation
+    assert spared[-1].observation == {}
+    assert [step._replace(observation=None) for step in spared] == [
+        step._replace(observation=None) for step in whole
+    ]
+    for one, other in zip(whole[:-1], spared[:-1], strict=True):
+        for name, value in one.observation.items():
+            np.testing.assert_array_equal(value, other.observation[name])
+
+
 @pytest.mark.parametrize("task", hvs_suite.TASKS)
 def test_doing_nothing_is_truncated_after_exactly_the_tasks_steps(named: Named, task: str) -> None:
     env = named(task, "state")
