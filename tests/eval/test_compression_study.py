@@ -145,7 +145,13 @@ def test_a_killed_setting_begins_anew_and_the_finished_stay(
         study_of(tmp_path, *SETTINGS[:2])
     again = study_of(tmp_path, *SETTINGS[:2])
     assert calls == [30, 30]
-    assert again.rows == studied[1].rows[:3]
+    *finished, encoded_again = again.rows
+    assert finished == studied[1].rows[:2]
+    # Encoders with several threads do not always give the same bytes.
+    before = studied[1].rows[2]
+    for camera, figures in encoded_again.cameras.items():
+        assert figures.psnr_db == pytest.approx(before.cameras[camera].psnr_db, abs=1.0)
+        assert figures.n == before.cameras[camera].n
 
 
 def test_decoded_frames_are_a_dataset_with_the_same_numbers(
