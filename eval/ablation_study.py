@@ -7,7 +7,7 @@ done again.
 
 import dataclasses
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -15,15 +15,11 @@ from typing import Any
 import pydantic
 
 from hvs_suite.errors import OptionError
-from hvs_suite.eval import protocol, result_file
 from hvs_suite.eval.comparison import Tally
 from hvs_suite.eval.result_file import Result
+from hvs_suite.eval.study_training import SPLIT, Report, earlier_result, train_and_judge
 from hvs_suite.policies.demonstrations import read_manifest
 
-Report = Callable[[str, float, str], None]
-"""Takes a stage, the share of it that is done (0 to 1) and a few words."""
-
-SPLIT = "dev"
 WHOLE = "everything"
 NO_DAGGER = "no DAgger"
 # A joint's step is seldom above this (rad), so errors weigh the same all over.
@@ -174,49 +170,34 @@ def _judged(
     data: Path, out: Path, name: str, budget: Budget, report: Report
 ) -> tuple[Result, int, float]:
     """Result of a row, how many demonstrations it had and how long it trained (h)."""
-    from hvs_suite.policies.pretrain import pretrain
-
     ablation, manifest = ABLATIONS[name], read_manifest(data)
     demonstrations = max(2, round(ablation.data_share * manifest.n_episodes))
     # Another budget is another experiment and lies beside the first.
     folder = out / f"steps-{budget.steps}-rounds-{budget.dagger_rounds}-seed-{budget.seed}"
     folder /= name.replace(",", "").replace("/", "-").replace(" ", "-").lower()
-    options: dict[str, Any] = {"dagger_rounds": budget.dagger_rounds, **ablation.options}
-    policy, path = folder / "policy", folder / f"{SPLIT}-{budget.episodes}.json"
-    if not path.exists():
-        pretrain(
+    options: dict[str, Any] = {
+        "steps": budget.steps,
+        "seed": budget.seed,
+        "dagger_rounds": budget.dagger_rounds,
+        "dagger_frames": budget.dagger_frames,
+        "episodes": demonstrations if ablation.data_share < 1.0 else None,
+        **ablation.options,
+    }
+    result = earlier_result(folder, budget.episodes)
+    if result is None:
+        result = train_and_judge(
+            name,
             data,
-            policy,
-            steps=budget.steps,
-            seed=budget.seed,
-            dagger_frames=budget.dagger_frames,
-            episodes=demonstrations if ablation.data_share < 1.0 else None,
-            workers=budget.workers,
-            on_progress=lambda state: report(
-                f"{name}: {state.stage}", state.share, f"{state.seconds_left:.0f} s left"
-            ),
-            **options,
-        )
-        n_played = 0
-
-        def note(_trial: object) -> None:
-            nonlocal n_played
-            n_played += 1
-            report(f"{name}: playing", n_played / budget.episodes, f"{n_played} episodes")
-
-        protocol.evaluate(
-            str(policy),
             manifest.task,
-            path,
-            split=SPLIT,
-            episodes=budget.episodes,
+            folder,
+            report,
+            scenarios=budget.episodes,
             workers=budget.workers,
-            progress=note,
+            **options,
         )
         # Gigabytes of frames that nobody asks for again.
         for kept in ("cache", "dagger"):
-            shutil.rmtree(policy / "training" / kept, ignore_errors=True)
-    result = result_file.load(path)
+            shutil.rmtree(folder / "policy" / "training" / kept, ignore_errors=True)
     return result, demonstrations, result.metadata.training_hours or 0.0
 
 

@@ -11,7 +11,7 @@ import dataclasses
 import io
 import math
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,8 +23,7 @@ from hvs_suite.datasets.metadata import read_metadata
 from hvs_suite.datasets.publication import Encoding, check_encoding, convert_to_video
 from hvs_suite.datasets.reader import Picture
 from hvs_suite.datasets.recompression import VideoCopy
-from hvs_suite.errors import DatasetError, OptionError, OutputError, ResultError
-from hvs_suite.eval import protocol, result_file
+from hvs_suite.errors import DatasetError, OptionError, OutputError
 from hvs_suite.eval.comparison import Tally
 from hvs_suite.eval.compression_figures import (
     Answers,
@@ -35,12 +34,11 @@ from hvs_suite.eval.compression_figures import (
     Success,
     located,
 )
+from hvs_suite.eval.result_file import Result
+from hvs_suite.eval.study_training import Report, earlier_result, train_and_judge
 from hvs_suite.files import check_writable, replacing
 from hvs_suite.policies.demonstrations import read_manifest, refuse_test_split
 from hvs_suite.policies.frame_cache import fingerprint
-
-Report = Callable[[str, float, str], None]
-"""Takes a stage, the share of it that is done (0 to 1) and a few words."""
 
 LOSSLESS = "PNG"
 CODECS = {"av1": ("libsvtav1", "AV1", 63), "h264": ("h264", "H.264", 51)}
@@ -51,7 +49,6 @@ DEFAULT_SETTINGS = (
     *("h264:15:yuv444p", "h264:23:yuv444p", "h264:30:yuv444p"),
 )
 LEROBOT_DEFAULT = Encoding()
-EVALUATION_SPLIT = "dev"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -315,50 +312,31 @@ def _trained(
     encoding: Encoding | None,
     training: Training,
     report: Report,
-) -> result_file.Result:
+) -> Result:
     """Result of a policy that learned from a setting's pictures; None are the lossless ones."""
-    from hvs_suite.policies.pretrain import pretrain
-
     # Another training is another experiment and lies beside the first.
     run = folder / f"steps-{training.steps}-seed-{training.seed}"
-    policy, result_path = run / "policy", run / f"{EVALUATION_SPLIT}-{training.episodes}.json"
-    if result_path.exists():
-        with contextlib.suppress(ResultError):
-            return result_file.load(result_path)
-    words = _words(encoding)
+    if (earlier := earlier_result(run, training.episodes)) is not None:
+        return earlier
     data = original.root
     if encoding is not None:
         data = folder / "frames"
         if not data.exists():
             _write_decoded(original, folder, encoding, data, report)
-    pretrain(
+    result = train_and_judge(
+        _words(encoding),
         data,
-        policy,
+        original.task,
+        run,
+        report,
+        scenarios=training.episodes,
+        workers=training.workers,
         steps=training.steps,
         seed=training.seed,
-        on_progress=lambda state: report(
-            f"{words}, {state.stage}", state.share, f"{state.seconds_left:.0f} s left"
-        ),
-    )
-    n_played = 0
-
-    def note(_trial: object) -> None:
-        nonlocal n_played
-        n_played += 1
-        report(f"{words}, playing", n_played / training.episodes, f"{n_played} episodes")
-
-    result = protocol.evaluate(
-        str(policy),
-        original.task,
-        result_path,
-        split=EVALUATION_SPLIT,
-        episodes=training.episodes,
-        workers=training.workers,
-        progress=note,
     )
     # Decoded frames are larger than the dataset; a dozen settings of them would fill the disk.
     shutil.rmtree(folder / "frames", ignore_errors=True)
-    shutil.rmtree(policy / "training" / "cache", ignore_errors=True)
+    shutil.rmtree(run / "policy" / "training" / "cache", ignore_errors=True)
     return result
 
 

@@ -98,7 +98,7 @@ def describe(
         "inputs": inputs,
         "output": "`action` 7: joint position targets in units of the joint range",
         "parameters": f"{outcome['n_parameters']:,}",
-        "demonstrations": "of the suite's expert; in a starting half of them near the goal",
+        "demonstrations": "of the suite's expert",
         "DAgger": f"{len(rounds)} rounds, {corrected:,} frames played by the policy itself under "
         "the expert's labels"
         if rounds

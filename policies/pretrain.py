@@ -30,17 +30,17 @@ from hvs_suite.policies.demonstrations import (
 from hvs_suite.policies.frame_cache import fingerprint
 from hvs_suite.policies.pretrain_settings import (
     Settings,
-    claim,
     new_policy,
     tightest_scale,
-    write_config,
 )
+from hvs_suite.policies.run_folder import claim, write_train_config
 from hvs_suite.policies.training_plot import draw_run
 from hvs_suite.policies.training_state import Counters, load_state, save_state
 
 if TYPE_CHECKING:
     from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
 
+PACKAGES = ("hvs-suite", "lerobot", "numpy", "torch")
 WARMUP_SHARE = 0.03
 GRADIENT_NORM = 1.0
 # Philox words that keep this stream apart from the held-out choice.
@@ -175,10 +175,22 @@ def pretrain(
     if inputs is not None:
         manifest = manifest.with_inputs(inputs)
     torch.set_num_threads(min(2, os.cpu_count() or 1))
-    claim(out, settings)
+    claim(out, dataclasses.asdict(settings))
     training = out / "training"
     policy = new_policy(manifest, settings)
-    write_config(out, data, settings, {"minutes": minutes, "steps": steps}, policy)
+    write_train_config(
+        out,
+        dataclasses.asdict(settings),
+        {"minutes": minutes, "steps": steps},
+        PACKAGES,
+        data=str(data),
+        policy={
+            "type": "hvs",
+            "channels": policy.config.channels,
+            "hidden": policy.config.hidden,
+            "weight_decay": policy.config.optimizer_weight_decay,
+        },
+    )
     run = _Run(out, on_progress)
     demonstrations = run.decode(manifest, training / "cache", settings)
     run.train(

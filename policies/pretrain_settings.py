@@ -1,17 +1,12 @@
-"""What a training run is a function of, and the fresh policy and the folder that it starts with."""
+"""What a training run is a function of, and the fresh policy that it starts with."""
 
 import dataclasses
-import json
 import math
-from collections.abc import Mapping
-from importlib.metadata import version
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 
-from hvs_suite.errors import OptionError, OutputError
-from hvs_suite.files import check_writable, replacing
+from hvs_suite.errors import OptionError
 from hvs_suite.policies.demonstrations import Manifest, calibration_of
 from hvs_suite.policies.hvs.network import IMAGE_PREFIX, STATE, Eye
 from hvs_suite.registry import find
@@ -19,8 +14,6 @@ from hvs_suite.tasks.variants import with_options
 
 if TYPE_CHECKING:
     from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
-
-PACKAGES = ("hvs-suite", "lerobot", "numpy", "torch")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -128,65 +121,3 @@ def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":
         if isinstance(module, Eye):
             module.train_in_bfloat16 = torch.cpu._is_avx512_bf16_supported()
     return policy
-
-
-def claim(out: Path, settings: Settings) -> None:
-    """Take the folder, or recognise it as an interrupted run with the same settings.
-
-    Args:
-        out: The run's folder.
-        settings: Of the run.
-
-    Raises:
-        OutputError: It cannot be written, or holds something else.
-    """
-    config = out / "train_config.json"
-    check_writable(config)
-    try:
-        begun = json.loads(config.read_text())["settings"]
-    except OSError:
-        if any(out.iterdir()):
-            raise OutputError(f"{out} is not empty; name another --out") from None
-        return
-    except (ValueError, KeyError, TypeError):
-        raise OutputError(f"{config} is damaged; name another --out") from None
-    wanted = json.loads(json.dumps(dataclasses.asdict(settings)))
-    differing = sorted(k for k in wanted if begun.get(k) != wanted[k])
-    if differing:
-        raise OutputError(
-            f"{out} holds a run with another {', '.join(differing)}; name another --out"
-        )
-
-
-def write_config(
-    out: Path,
-    data: Path,
-    settings: Settings,
-    budget: Mapping[str, float | None],
-    policy: "HvsPolicy",
-) -> None:
-    """Write ``train_config.json``, from which the run can be repeated.
-
-    Args:
-        out: The run's folder.
-        data: Root of the dataset.
-        settings: Of the run.
-        budget: ``minutes`` and ``steps``.
-        policy: Its sizes are noted.
-    """
-    content = {
-        "format": 1,
-        "data": str(data),
-        "settings": dataclasses.asdict(settings),
-        "budget": budget,
-        "policy": {
-            "type": "hvs",
-            "channels": policy.config.channels,
-            "hidden": policy.config.hidden,
-            "weight_decay": policy.config.optimizer_weight_decay,
-        },
-        "versions": {name: version(name) for name in PACKAGES},
-        "threads": torch.get_num_threads(),
-    }
-    with replacing(out / "train_config.json") as temporary:
-        temporary.write_text(json.dumps(content, indent=2) + "\n")

@@ -2,7 +2,7 @@
 
 import importlib.metadata
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,25 +10,18 @@ from hvs_suite.errors import OutputError
 from hvs_suite.files import check_writable, replacing
 
 CONFIG = "train_config.json"
-PACKAGES = ("hvs-suite", "mujoco", "numpy", "stable-baselines3", "torch")
 
 
-def claim(
-    out: Path, settings: Mapping[str, Any], budget: Mapping[str, Any], *, device: str
-) -> None:
+def claim(out: Path, settings: Mapping[str, Any]) -> None:
     """Take a folder, or recognise it as an interrupted run with the same settings.
 
     Args:
         out: The folder; made if missing.
-        settings: What the run is a function of, as JSON has it.
-        budget: How long to train; may differ from one sitting to the next.
-        device: Noted beside the versions of what trains.
+        settings: What the run is a function of, the budget aside.
 
     Raises:
         OutputError: It cannot be written, or holds something else.
     """
-    import torch
-
     config = out / CONFIG
     check_writable(config)
     try:
@@ -36,21 +29,42 @@ def claim(
     except OSError:
         if any(out.iterdir()):
             raise OutputError(f"{out} is not empty; name another --out") from None
+        return
     except (ValueError, KeyError, TypeError):
         raise OutputError(f"{config} is damaged; name another --out") from None
-    else:
-        differing = sorted(name for name in settings if begun.get(name) != settings[name])
-        if differing:
-            raise OutputError(
-                f"{out} holds a run with another {', '.join(differing)}; name another --out"
-            )
+    wanted = json.loads(json.dumps(settings))
+    differing = sorted(name for name in wanted if begun.get(name) != wanted[name])
+    if differing:
+        raise OutputError(
+            f"{out} holds a run with another {', '.join(differing)}; name another --out"
+        )
+
+
+def write_train_config(
+    out: Path,
+    settings: Mapping[str, Any],
+    budget: Mapping[str, Any],
+    packages: Iterable[str],
+    **notes: Any,
+) -> None:
+    """Write ``train_config.json``, from which a run can be repeated.
+
+    Args:
+        out: The claimed folder.
+        settings: As claimed.
+        budget: How long to train; may differ from one sitting to the next.
+        packages: What trains; their versions are noted.
+        **notes: What else is worth knowing, as JSON has it.
+    """
+    import torch
+
     content = {
         "format": 1,
         "settings": settings,
         "budget": budget,
-        "device": device,
+        **notes,
+        "versions": {name: importlib.metadata.version(name) for name in packages},
         "threads": torch.get_num_threads(),
-        "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
     }
-    with replacing(config) as temporary:
+    with replacing(out / CONFIG) as temporary:
         temporary.write_text(json.dumps(content, indent=2) + "\n")

@@ -22,7 +22,7 @@ from stable_baselines3.common.logger import Logger
 
 from hvs_suite.errors import OptionError
 from hvs_suite.files import replacing
-from hvs_suite.policies.run_folder import claim
+from hvs_suite.policies.run_folder import claim, write_train_config
 from hvs_suite.policies.sac.curves import Curves
 from hvs_suite.policies.sac.evaluation import (
     Evaluation,
@@ -46,6 +46,7 @@ from hvs_suite.tasks.variants import (
     with_options,
 )
 
+PACKAGES = ("hvs-suite", "mujoco", "numpy", "stable-baselines3", "torch")
 LOG_EVERY = 10
 """Iterations between two points of a curve."""
 INPUTS = PRESETS["vision"]
@@ -159,7 +160,9 @@ def train_sac(
         "seed": seed,
         **json.loads(json.dumps(dataclasses.asdict(settings))),
     }
-    claim(out, identity, {"minutes": minutes, "steps": steps}, device=device)
+    claim(out, identity)
+    budget = {"minutes": minutes, "steps": steps}
+    write_train_config(out, identity, budget, PACKAGES, device=device)
     # SB3 draws from the global generators of NumPy and torch.
     with contextlib.ExitStack() as stack:
         stack.enter_context(library_seeds(seed))

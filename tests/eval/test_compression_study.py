@@ -15,7 +15,7 @@ from hvs_suite.cli.main import run
 from hvs_suite.datasets import publication, reader
 from hvs_suite.datasets.recompression import VideoCopy
 from hvs_suite.errors import DatasetError, OptionError, OutputError
-from hvs_suite.eval import compression_report, compression_study
+from hvs_suite.eval import compression_report, compression_study, study_training
 from hvs_suite.eval.compression_figures import Row, Study, Success
 from hvs_suite.eval.compression_study import Training, parse_setting, run_study
 
@@ -189,7 +189,7 @@ def test_a_policy_learns_from_each_setting_and_is_paired_with_the_lossless_one(
     # What only training needed is gone, what was found is not sought again.
     assert not list(out.rglob("frames"))
     assert not list(out.rglob("cache"))
-    monkeypatch.setattr(compression_study.protocol, "evaluate", None)
+    monkeypatch.setattr(study_training.protocol, "evaluate", None)
     assert study_of(out, "h264:30", training=training) == found
 
 

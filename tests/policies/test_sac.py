@@ -188,8 +188,6 @@ def test_a_killed_run_ends_like_one_that_was_left_alone(whole, tmp_path):
 
 
 def test_the_callers_own_draws_do_not_notice(whole, tmp_path):
-    np.random.seed(5)  # noqa: NPY002
-    torch.manual_seed(5)
     before = np.random.get_state()[1].copy(), torch.get_rng_state()  # noqa: NPY002
     train_sac("align-easy", tmp_path / "out", steps=6, **OPTIONS)
     np.testing.assert_array_equal(before[0], np.random.get_state()[1])  # noqa: NPY002
