@@ -30,7 +30,9 @@ NOISE_TIME_S = 0.3
 NOISE_FULL_DISTANCE_M = 0.2
 """Distance to the goal from which on the perturbation has its full size (m)."""
 NOISE_FLOOR = 0.02
-"""Share of it that is left at the goal, so that the last millimetres are demonstrated as well."""
+"""Share of it that is left at the goal, so that the last millimetres are demonstrated as well;
+of a tolerance below a millimetre, so many times less: who is shaken by more than the tolerance never
+arrives."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,8 +155,9 @@ class _Perturbation:
     """An Ornstein-Uhlenbeck process on the joint targets that dwindles towards the goal.
 
     x[k+1] = rho x[k] + sqrt(1 - rho^2) n, rho = exp(-period / correlation time); what is added is
-    noise * share * x, with share = distance / 0.2 m cut to [0.02, 1]. The draws come from the
-    scenario's own generator, so a demonstration depends on nothing but its index.
+    noise * share * x, with share = distance / 0.2 m cut to [floor, 1] and floor = 0.02 times the
+    task's tightest tolerance in mm, at most 0.02. The draws come from the scenario's own generator,
+    so a demonstration depends on nothing but its index.
     """
 
     def __init__(self, env: "Environment", scenario: int, noise: float) -> None:
@@ -162,12 +165,13 @@ class _Perturbation:
         self._noise = noise
         self._random = env.task.source.generator(NOISE_STREAM, scenario)
         self._keep = math.exp(-env.variant.control_period_s / NOISE_TIME_S)
+        self._floor = NOISE_FLOOR * min(1.0, env.variant.tightest_tolerance_mm)
         self._state = self._random.normal(size=len(JOINT_RANGE_RAD))
 
     def apply(self, action: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """The action (7,) to execute instead; in [-1, 1]."""
         distance = self._env.info["position_error_mm"] / 1000.0
-        share = min(1.0, max(NOISE_FLOOR, distance / NOISE_FULL_DISTANCE_M))
+        share = min(1.0, max(self._floor, distance / NOISE_FULL_DISTANCE_M))
         added = self._noise * share * self._state / JOINT_RANGE_RAD
         fresh = self._random.normal(size=len(JOINT_RANGE_RAD))
         self._state = self._keep * self._state + math.sqrt(1.0 - self._keep**2) * fresh

@@ -174,7 +174,7 @@ def pretrain(
     settings.check(manifest)
     if inputs is not None:
         manifest = manifest.with_inputs(inputs)
-    torch.set_num_threads(min(2, os.cpu_count() or 1))
+    torch.set_num_threads(min(2, len(os.sched_getaffinity(0))))
     claim(out, dataclasses.asdict(settings))
     training = out / "training"
     policy = new_policy(manifest, settings)

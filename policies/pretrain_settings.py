@@ -79,8 +79,7 @@ def tightest_scale(manifest: Manifest) -> float:
         manifest: Of the dataset.
     """
     task = with_options(find(manifest.task), manifest.options)
-    tolerances = (task.position_tolerance_mm, task.lateral_tolerance_mm, task.height_tolerance_mm)
-    return 5e-3 * min(tolerance for tolerance in tolerances if tolerance is not None)
+    return 5e-3 * task.tightest_tolerance_mm
 
 
 def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":

@@ -201,6 +201,12 @@ class AlignVariant:
             raise OptionError("eth_position_m lies straight above eth_look_at_m; shift one of them")
 
     @property
+    def tightest_tolerance_mm(self) -> float:
+        """Smallest of the bounds on the position (mm)."""
+        bounds = (self.position_tolerance_mm, self.lateral_tolerance_mm, self.height_tolerance_mm)
+        return min(bound for bound in bounds if bound is not None)
+
+    @property
     def instruction(self) -> str:
         """The task as one sentence, identical in environment and dataset."""
         return (

@@ -151,7 +151,7 @@ def train_sac(
     options = {**(options or {}), "rewards": tuple(rewards)}
     variant = with_options(find(task), options)
     _check(variant, minutes, steps, seed, split, eval_every, eval_episodes, device)
-    torch.set_num_threads(min(2, os.cpu_count() or 1))
+    torch.set_num_threads(min(2, len(os.sched_getaffinity(0))))
     identity = {
         "task": task,
         "task_version": variant.version,
