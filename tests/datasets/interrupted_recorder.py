@@ -8,6 +8,7 @@ import json
 import os
 import random
 import resource
+import select
 import signal
 import sys
 import time
@@ -43,8 +44,29 @@ def ended(child):
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
-def play(root):
-    record(TASK, EPISODES, "train", root, resume=True, block=BLOCK)
+def play(root, progress=None):
+    record(TASK, EPISODES, "train", root, resume=True, block=BLOCK, progress=progress)
+
+
+def watched(root, episodes, pause_s=0.0, kill=False):
+    """Runs a recorder until so many episodes are there, and then for a while, or to its end.
+
+    Counted in episodes, because no two recordings take the same time. Returns its exit code, and
+    the seconds to its first episode and between the later ones.
+    """
+    reader, writer = os.pipe()
+    moments = [time.monotonic()]
+    child = in_child(play, root, lambda _: os.write(writer, b"."))
+    os.close(writer)
+    while len(moments) <= episodes and os.read(reader, 1):
+        moments.append(time.monotonic())
+    if kill:
+        select.select([], [], [], pause_s)
+        os.kill(child, signal.SIGKILL)
+    code = ended(child)
+    os.close(reader)
+    first_s = moments[min(1, episodes)] - moments[0]
+    return code, first_s, (moments[-1] - moments[0] - first_s) / max(1, episodes - 1)
 
 
 def load(root):
@@ -66,17 +88,17 @@ def fill_the_disk(root, said):
 
 def main(folder, kills, seed):
     chance = random.Random(seed)
-    began = time.monotonic()
-    assert ended(in_child(play, folder / "whole")) == 0
-    whole_s = time.monotonic() - began
+    code, first_s, each_s = watched(folder / "whole", EPISODES)
+    assert code == 0
     outcomes = []
+    # Before the first episode, after the last, and everywhere between.
+    order = chance.sample(range(EPISODES + 1), EPISODES + 1)
     for number in range(kills):
         root = folder / f"killed-{number}"
-        after_s = chance.uniform(0.2, 0.98) * whole_s
-        child = in_child(play, root)
-        time.sleep(after_s)
-        os.kill(child, signal.SIGKILL)
-        outcome = {"after_s": after_s, "killed": ended(child) == -signal.SIGKILL, "published": 0}
+        episodes = order[number % len(order)]
+        pause_s = chance.random() * (each_s if episodes else first_s)
+        code, *_ = watched(root, episodes, pause_s, kill=True)
+        outcome = {"episodes": episodes, "killed": code == -signal.SIGKILL, "published": 0}
         info = root / "meta" / "info.json"
         if info.exists():
             outcome["published"] = json.loads(info.read_text())["total_episodes"]
