@@ -8,7 +8,6 @@ killed, it goes on from its last checkpoint when the same command is given again
 import dataclasses
 import json
 import math
-import os
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -174,7 +173,7 @@ def pretrain(
     settings.check(manifest)
     if inputs is not None:
         manifest = manifest.with_inputs(inputs)
-    torch.set_num_threads(min(2, len(os.sched_getaffinity(0))))
+    torch.set_num_threads(min(2, torch.get_num_threads()))
     claim(out, dataclasses.asdict(settings))
     training = out / "training"
     policy = new_policy(manifest, settings)

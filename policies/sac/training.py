@@ -8,7 +8,6 @@ import contextlib
 import dataclasses
 import json
 import math
-import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -151,7 +150,7 @@ def train_sac(
     options = {**(options or {}), "rewards": tuple(rewards)}
     variant = with_options(find(task), options)
     _check(variant, minutes, steps, seed, split, eval_every, eval_episodes, device)
-    torch.set_num_threads(min(2, len(os.sched_getaffinity(0))))
+    torch.set_num_threads(min(2, torch.get_num_threads()))
     identity = {
         "task": task,
         "task_version": variant.version,
