@@ -31,8 +31,8 @@ NOISE_FULL_DISTANCE_M = 0.2
 """Distance to the goal from which on the perturbation has its full size (m)."""
 NOISE_FLOOR = 0.02
 """Share of it that is left at the goal, so that the last millimetres are demonstrated as well;
-of a tolerance below a millimetre, so many times less: who is shaken by more than the tolerance never
-arrives."""
+less in proportion where the tolerance is below a millimetre, because who is shaken by more than
+that never arrives."""
 
 
 @dataclasses.dataclass(frozen=True)

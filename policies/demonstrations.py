@@ -237,13 +237,13 @@ class Demonstrations:
         return Recording({**recording.columns, MEMORY: memory}, recording.images)
 
     def batch(self, indices: npt.NDArray[np.int64]) -> dict[str, Tensor]:
-        """Frames as LeRobot's loader would give them.
+        """Frames as LeRobot's loader would give them, but for images left as bytes.
 
         Args:
             indices: Of the frames, (B,).
 
         Returns:
-            Images (B, C, H, W) float32 in [0, 1], and float32 the columns of `_read_columns` and
+            Images (B, C, H, W) uint8, and float32 the columns of `_read_columns` and
             ``memory`` (B, 4).
         """
         # Neighbours on disk together: the same rows, fewer page faults.
@@ -258,10 +258,17 @@ class Demonstrations:
             for key in first.columns
             if key != EPISODE
         }
-        for key in first.images:
-            images = torch.from_numpy(np.concatenate([r.images[key][rows] for r, rows in parts]))
+        for key, frames in first.images.items():
+            images = torch.empty((len(indices), *frames.shape[1:]), dtype=torch.uint8)
+            begin = 0
+            for recording, rows in parts:
+                end = begin + len(rows)
+                # Clipping copies straight into place, where checking would take a buffer.
+                place = images[begin:end].numpy()
+                np.take(recording.images[key], rows, axis=0, out=place, mode="clip")
+                begin = end
             # (B, H, W, C) stays the layout in memory, which is what the convolutions want.
-            batch[key] = images.to(torch.float32).div_(255.0).permute(0, 3, 1, 2)
+            batch[key] = images.permute(0, 3, 1, 2)
         return batch
 
 

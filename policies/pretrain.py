@@ -19,6 +19,7 @@ import torch
 
 from hvs_suite.errors import OptionError
 from hvs_suite.files import replacing
+from hvs_suite.policies.allocator import keep_freed_memory
 from hvs_suite.policies.dagger import RoundSummary, play_round, read_round, round_shares
 from hvs_suite.policies.demonstrations import (
     Demonstrations,
@@ -173,6 +174,7 @@ def pretrain(
     settings.check(manifest)
     if inputs is not None:
         manifest = manifest.with_inputs(inputs)
+    keep_freed_memory()
     torch.set_num_threads(min(2, torch.get_num_threads()))
     claim(out, dataclasses.asdict(settings))
     training = out / "training"

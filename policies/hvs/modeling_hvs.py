@@ -72,8 +72,8 @@ class HvsPolicy(PreTrainedPolicy):
         """Loss of a batch.
 
         Args:
-            batch: The inputs, ``action`` (B, 7), and where the dataset has them
-                ``privileged.target_<camera>`` (B, 4), ``privileged.goal_position`` and
+            batch: The inputs (images uint8, or float in [0, 1]), ``action`` (B, 7), and where the
+                dataset has them ``privileged.target_<camera>`` (B, 4), ``privileged.goal_position`` and
                 ``privileged.goal_normal`` (B, 3); ``memory`` (B, 4) where the target was seen
                 earlier in the episode, empty if it is missing.
 

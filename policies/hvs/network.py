@@ -196,7 +196,7 @@ class Eye(nn.Module):
         """Find the target.
 
         Args:
-            images: (B, C, H, W) in [0, 1].
+            images: (B, C, H, W), uint8, or float in [0, 1].
 
         Returns:
             Where it is, how large, and whether it is there.
@@ -221,7 +221,7 @@ class Eye(nn.Module):
         """Where the eye looks for the target.
 
         Args:
-            images: (B, C, H, W) in [0, 1].
+            images: (B, C, H, W), uint8, or float in [0, 1].
 
         Returns:
             The distribution whose mean is the keypoint, (B, h, w), summing to 1.
@@ -231,8 +231,13 @@ class Eye(nn.Module):
 
     def _maps(self, images: Tensor) -> Tensor:
         """Features of every cell, (B, h, w, channels)."""
-        x = images.contiguous(memory_format=torch.channels_last) - 0.5
         half = self.train_in_bfloat16 and self.training
+        if images.dtype == torch.uint8:
+            # Bytes less their mean are exact in bfloat16, and half the size to begin with.
+            x = images.to(torch.bfloat16 if half else torch.float32).sub_(127.5).mul_(1.0 / 255.0)
+        else:
+            x = images - 0.5
+        x = x.contiguous(memory_format=torch.channels_last)
         with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=half):
             maps: Tensor = self.features(x)
         return maps.float().permute(0, 2, 3, 1)
@@ -314,7 +319,7 @@ class HvsNetwork(nn.Module):
         """Run the eyes.
 
         Args:
-            images: Camera name to (B, C, H, W) in [0, 1].
+            images: Camera name to (B, C, H, W), uint8, or float in [0, 1].
 
         Returns:
             Camera name to what it saw.
@@ -330,7 +335,7 @@ class HvsNetwork(nn.Module):
         """Decide.
 
         Args:
-            images: Camera name to (B, C, H, W) in [0, 1].
+            images: Camera name to (B, C, H, W), uint8, or float in [0, 1].
             state: Measured joint positions (rad), then velocities (rad/s), (B, 14) or (B, 7);
                 None if the policy has no joint inputs.
             memory: Where the target was last seen (m, base frame), and 1 if it was ever seen in
