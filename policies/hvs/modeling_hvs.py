@@ -73,9 +73,9 @@ class HvsPolicy(PreTrainedPolicy):
 
         Args:
             batch: The inputs (images uint8, or float in [0, 1]), ``action`` (B, 7), and where the
-                dataset has them ``privileged.target_<camera>`` (B, 4), ``privileged.goal_position`` and
-                ``privileged.goal_normal`` (B, 3); ``memory`` (B, 4) where the target was seen
-                earlier in the episode, empty if it is missing.
+                dataset has them ``privileged.target_<camera>`` (B, 4),
+                ``privileged.goal_position`` and ``privileged.goal_normal`` (B, 3); ``memory``
+                (B, 4) where the target was seen earlier in the episode, empty if it is missing.
 
         Returns:
             The loss, and its parts as numbers.
