@@ -1,20 +1,20 @@
-"""Statistics of an episode, number for number as LeRobot 0.6 computes them, and much cheaper.
+"""Statistics of an episode, as LeRobot 0.6 computes them, and much cheaper.
 
 LeRobot keeps least, greatest, mean, deviation and five quantiles of every dimension. It estimates
 the quantiles with histograms of 5000 bins; here the bin of each value is looked up instead of
-counting into all of them. Sums run in float32 in its order, because ``hvs check`` holds datasets
-of any origin to the same numbers.
+counting into all of them. Columns of numbers come out number for number the same. Pixels are
+counted by shade, so that means and deviations are exact, where LeRobot's float32 sums lose up to
+a hundredth, and the deviation of an even picture up to a tenth.
 """
 
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
-from hvs_suite.datasets.moments import sampled_pictures
+from hvs_suite.datasets.moments import Moments, sampled_pictures, shade_counts
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -23,9 +23,6 @@ NAMES = ("min", "max", "mean", "std", "q01", "q10", "q50", "q90", "q99")
 _MIN, _MAX, _MEAN, _STD = range(4)
 _BINS = 5000
 _MARGIN = 1e-10
-# Each shade and its square, two float32 in the place of one float64.
-_SHADES = np.arange(256, dtype=np.float32)
-_WITH_SQUARES = np.stack([_SHADES, _SHADES**2], axis=1).view(np.float64)[:, 0]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -105,62 +102,25 @@ def picture_stats(
     if not features:
         return {}
     chosen = {name: sampled_pictures(pictures) for name, pictures in features.items()}
-    parts = [_sums_and_counts(pictures) for pictures in chosen.values()]
     # From here on channels of all features go through NumPy together, as columns do.
-    total, squares, counts = (np.concatenate(part, axis=-1) for part in zip(*parts, strict=True))
-    low = (counts > 0).argmax(axis=0).astype(np.float32)
-    high = 255 - (counts[::-1] > 0).argmax(axis=0).astype(np.float32)
+    counts = np.concatenate([shade_counts(pictures) for pictures in chosen.values()], axis=1)
+    moments = Moments.of_shades(counts, 0)
     upto = np.cumsum(counts, axis=0)
-    pixels = upto[-1].astype(np.float32)
-    mean = total / pixels
-    variance = squares / pixels - mean**2
     wanted = np.array(QUANTILES)[:, None] * upto[-1]
     # A shade has a bin to itself, so the quantile's shade alone decides.
     shades = (upto < wanted[:, None]).sum(axis=1)
-    edges = _Edges(low, high)
+    edges = _Edges(*(np.float32(255.0 * bound) for bound in (moments.low, moments.high)))
     inside = np.take_along_axis(counts, shades, axis=0)
     before = np.take_along_axis(upto, shades, axis=0) - inside
     quantiles = edges.within(edges.bins(shades.astype(np.float32)), (wanted - before) / inside)
-    # LeRobot divides the first four in float32, quantiles in float64.
-    first = np.stack([low, high, mean, np.sqrt(np.maximum(variance, np.float32(0.0)))])
-    values = np.concatenate([first / np.float32(255.0), quantiles / 255.0])
+    first = np.stack([moments.low, moments.high, moments.mean, np.sqrt(moments.variance)])
+    values = np.concatenate([first, quantiles / 255.0])
     ends = np.cumsum([pictures.shape[-1] for pictures in chosen.values()])
     split = np.split(values, ends[:-1], axis=1)
     return {
         name: FeatureStats(len(pictures), part)
         for (name, pictures), part in zip(chosen.items(), split, strict=True)
     }
-
-
-def _sums_and_counts(
-    pictures: npt.NDArray[np.uint8],
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.int64]]:
-    """Of pictures (n, h, w, c): sums (c,), of squares too, and pixels of each shade (256, c)."""
-    n, height, _, channels = pictures.shape
-    flat = np.ascontiguousarray(pictures.reshape(n * height, -1, channels))
-    histograms = [cv2.calcHist([flat], [c], None, [256], [0, 256]) for c in range(channels)]
-    return *_sums(pictures), np.concatenate(histograms, axis=1).astype(np.int64)
-
-
-def _sums(
-    pictures: npt.NDArray[np.uint8],
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Sums (c,) in float32 over the pixels of pictures (n, h, w, c), and of their squares.
-
-    Rounded as NumPy rounds them, which adds pixel after pixel.
-    """
-    if not pictures.flags.c_contiguous:
-        pixels = pictures.reshape(-1, pictures.shape[-1]).astype(np.float32)
-        return pixels.sum(axis=0), (pixels * pixels).sum(axis=0)
-    # OpenCV adds in the same order at a quarter of the price. Picture by picture, with the sums so
-    # far as the first pixel: a buffer that stays in the cache.
-    n, height, width, channels = pictures.shape
-    rows = np.zeros((1 + height * width, channels), np.float64)
-    sums = rows[:1].view(np.float32)
-    for picture in pictures.reshape(n, -1, channels):
-        cv2.LUT(picture, _WITH_SQUARES, rows[1:])
-        sums[:] = cv2.reduce(rows.view(np.float32), 0, cv2.REDUCE_SUM)
-    return sums[0, 0::2], sums[0, 1::2]
 
 
 def _of_numbers(values: npt.NDArray[Any]) -> FloatArray:

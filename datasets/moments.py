@@ -1,4 +1,4 @@
-"""Count, extremes, mean and deviation of a feature, computed as LeRobot computes them.
+"""Count, extremes, mean and deviation of a feature, of the values that LeRobot looks at.
 
 LeRobot's quantiles are histogram estimates averaged over episodes; they are not checked.
 """
@@ -7,6 +7,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -17,7 +18,10 @@ _DOWNSAMPLE_FROM_PX = 300
 _DOWNSAMPLE_TO_PX = 150
 _MAX_SAMPLED = 100
 _MIN_POWER_SAMPLES = 10_000
-_RELATIVE = 2e-5
+_ROUNDING = 2e-5
+# LeRobot adds up the pixels of all pictures in float32, which loses up to a hundredth.
+_PICTURE_ROUNDING = 1e-2
+_SHADES = np.arange(256.0)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -30,6 +34,7 @@ class Moments:
         high: Greatest values (k,).
         mean: Means (k,).
         variance: Variances (k,), population.
+        rounding: Relative error that the sums of whoever lists such statistics may have.
     """
 
     count: int
@@ -37,33 +42,37 @@ class Moments:
     high: FloatArray
     mean: FloatArray
     variance: FloatArray
+    rounding: float = _ROUNDING
 
     @classmethod
-    def of(cls, values: npt.NDArray[Any], count: int | None = None) -> Self:
-        """Moments of values (n, k), which stand for ``count`` frames (n by default).
-
-        Sums run in the precision that LeRobot uses: over a picture's pixels its float32 sums are
-        off by up to a thousandth, which would otherwise count as damage.
-        """
+    def of(cls, values: npt.NDArray[Any]) -> Self:
+        """Moments of values (n, k), their sums in the precision that LeRobot uses."""
         values = values.astype(np.result_type(values.dtype, np.float32), copy=False)
         mean = np.mean(values, axis=0)
         squares = np.mean(values**2, axis=0)
         return cls(
-            len(values) if count is None else count,
+            len(values),
             np.min(values, axis=0).astype(np.float64),
             np.max(values, axis=0).astype(np.float64),
             mean.astype(np.float64),
             np.maximum(squares - mean**2, 0.0).astype(np.float64),
         )
 
-    def scaled(self, factor: float) -> Self:
-        """Moments of the values times a factor."""
-        return dataclasses.replace(
-            self,
-            low=self.low * factor,
-            high=self.high * factor,
-            mean=self.mean * factor,
-            variance=self.variance * factor**2,
+    @classmethod
+    def of_shades(cls, counts: npt.NDArray[np.int64], frames: int) -> Self:
+        """Moments by channel, in [0, 1], of pixels counted by shade.
+
+        Args:
+            counts: As ``shade_counts`` gives them, (256, c).
+            frames: Pictures that were counted.
+        """
+        pixels = counts.sum(axis=0)
+        mean = _SHADES @ counts / pixels
+        variance = np.maximum(_SHADES**2 @ counts / pixels - mean**2, 0.0)
+        low = (counts > 0).argmax(axis=0)
+        high = 255 - (counts[::-1] > 0).argmax(axis=0)
+        return cls(
+            frames, low / 255.0, high / 255.0, mean / 255.0, variance / 255.0**2, _PICTURE_ROUNDING
         )
 
 
@@ -74,7 +83,15 @@ def sample(pictures: Sequence[npt.NDArray[np.uint8]]) -> Moments:
         pictures: uint8 (H, W, 3) each, all alike in shape.
     """
     chosen = sampled_pictures(pictures)
-    return Moments.of(chosen.reshape(-1, chosen.shape[-1]), len(chosen)).scaled(1.0 / 255.0)
+    return Moments.of_shades(shade_counts(chosen), len(chosen))
+
+
+def shade_counts(pictures: npt.NDArray[np.uint8]) -> npt.NDArray[np.int64]:
+    """How many pixels of pictures (n, h, w, c) have each shade, (256, c)."""
+    n, height, _, channels = pictures.shape
+    flat = pictures.reshape(n * height, -1, channels)
+    counts = [cv2.calcHist([flat], [c], None, [256], [0, 256]) for c in range(channels)]
+    return np.concatenate(counts, axis=1).astype(np.int64)
 
 
 def sampled_pictures(pictures: Sequence[npt.NDArray[np.uint8]]) -> npt.NDArray[np.uint8]:
@@ -91,11 +108,7 @@ def sampled_pictures(pictures: Sequence[npt.NDArray[np.uint8]]) -> npt.NDArray[n
     indices = np.round(np.linspace(0, n - 1, taken)).astype(int)
     side = max(pictures[0].shape[:2])
     step = 1 if side < _DOWNSAMPLE_FROM_PX else int(side / _DOWNSAMPLE_TO_PX)
-    chosen = np.stack([pictures[i][::step, ::step] for i in indices])
-    if taken > 1:
-        return chosen
-    # Of a single picture LeRobot sums plane by plane, which rounds otherwise than pixel by pixel.
-    return np.ascontiguousarray(chosen.transpose(0, 3, 1, 2)).transpose(0, 2, 3, 1)
+    return np.stack([pictures[i][::step, ::step] for i in indices])
 
 
 def merge(parts: Sequence[Moments]) -> Moments:
@@ -111,6 +124,7 @@ def merge(parts: Sequence[Moments]) -> Moments:
         np.max([part.high for part in parts], axis=0),
         mean,
         variance,
+        max(part.rounding for part in parts),
     )
 
 
@@ -134,7 +148,7 @@ def compare(found: Moments, listed: Mapping[str, Any], slack: float = 0.0) -> st
     if count != found.count:
         return f"count is {count}, not {found.count}"
     size = np.abs(found.mean) + np.sqrt(found.variance)
-    scale = _RELATIVE * np.maximum(size, np.maximum(np.abs(found.low), np.abs(found.high))) + 1e-7
+    scale = found.rounding * np.maximum(size, np.maximum(np.abs(found.low), np.abs(found.high))) + 1e-7
     wanted = {"mean": (found.mean, scale + slack)}
     if not slack:
         wanted |= {"min": (found.low, scale), "max": (found.high, scale)}
@@ -145,7 +159,7 @@ def compare(found: Moments, listed: Mapping[str, Any], slack: float = 0.0) -> st
         if not np.all(np.abs(values[name] - right) <= tolerance):
             return _worst(name, values[name], right)
     if not slack:
-        tolerance = _RELATIVE * (found.variance + found.mean**2) + 1e-9
+        tolerance = found.rounding * (found.variance + found.mean**2) + 1e-9
         if not np.all(np.abs(values["std"] ** 2 - found.variance) <= tolerance):
             return _worst("std", values["std"], np.sqrt(found.variance))
     return ""
