@@ -19,8 +19,10 @@ from hvs_suite.datasets.moments import Moments, sampled_pictures, shade_counts
 FloatArray = npt.NDArray[np.float64]
 
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
-NAMES = ("min", "max", "mean", "std", "q01", "q10", "q50", "q90", "q99")
+STAT_NAMES = ("min", "max", "mean", "std", "q01", "q10", "q50", "q90", "q99")
 _MIN, _MAX, _MEAN, _STD = range(4)
+STAT_ORDER = (*STAT_NAMES[: _STD + 1], "count", *STAT_NAMES[_STD + 1 :])
+"""The order of LeRobot's columns."""
 _BINS = 5000
 _MARGIN = 1e-10
 
@@ -31,7 +33,7 @@ class FeatureStats:
 
     Attributes:
         count: Frames they were taken from.
-        values: (9, k), one row each of ``NAMES``.
+        values: (9, k), one row each of ``STAT_NAMES``.
     """
 
     count: int
@@ -40,15 +42,14 @@ class FeatureStats:
     def named(self, *, picture: bool) -> dict[str, Any]:
         """As LeRobot nests them: lists (k,), of pictures (k, 1, 1), and ``count`` (1,)."""
         rows = self.values[:, :, None, None] if picture else self.values
-        named: dict[str, Any] = {name: row.tolist() for name, row in zip(NAMES, rows, strict=True)}
-        # The order of LeRobot's columns: count before the quantiles.
-        head = {name: named.pop(name) for name in NAMES[: _STD + 1]}
-        return {**head, "count": [self.count], **named}
+        named: dict[str, Any] = dict(zip(STAT_NAMES, rows.tolist(), strict=True))
+        named["count"] = [self.count]
+        return {name: named[name] for name in STAT_ORDER}
 
     @classmethod
     def from_named(cls, named: Mapping[str, Any]) -> "FeatureStats":
         """Reads what ``named`` gave."""
-        values = np.array([np.ravel(named[name]) for name in NAMES], np.float64)
+        values = np.array([np.ravel(named[name]) for name in STAT_NAMES], np.float64)
         return cls(int(np.ravel(named["count"])[0]), values)
 
 

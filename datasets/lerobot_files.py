@@ -6,7 +6,7 @@ Hugging Face's ``datasets`` and takes 20 ms a frame, more than simulating it, an
 """
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from hvs_suite.datasets.episode_stats import FeatureStats
+from hvs_suite.datasets.episode_stats import STAT_NAMES, STAT_ORDER, FeatureStats
 
 INFO = "meta/info.json"
 STATS = "meta/stats.json"
@@ -124,10 +124,8 @@ def data_table(schema: pa.Schema, columns: Columns) -> pa.Table:
     )
 
 
-def episode_row(
-    episode: int, length: int, first: int, file: int, task: str, stats: Iterable[tuple[str, Any]]
-) -> dict[str, Any]:
-    """The row of an episode in ``meta/episodes``, the place of the row itself left out.
+def episode_row(episode: int, length: int, first: int, file: int, task: str) -> dict[str, Any]:
+    """The row of an episode in ``meta/episodes``, statistics and the place of the row left out.
 
     Args:
         episode: Its index.
@@ -135,10 +133,9 @@ def episode_row(
         first: Index of its first frame in the dataset.
         file: Number of its data file.
         task: The task as a sentence.
-        stats: Feature and its named statistics.
     """
     chunk, place = divmod(file, FILES_A_CHUNK)
-    row = {
+    return {
         "episode_index": episode,
         "tasks": [task],
         "length": length,
@@ -147,18 +144,40 @@ def episode_row(
         "dataset_from_index": first,
         "dataset_to_index": first + length,
     }
-    for feature, named in stats:
-        row |= {f"{STATS_PREFIX}{feature}/{name}": value for name, value in named.items()}
-    return row
 
 
-def write_episodes(root: Path, number: int, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Writes a file of ``meta/episodes``."""
+def write_episodes(
+    root: Path,
+    number: int,
+    rows: Sequence[Mapping[str, Any]],
+    features: Mapping[str, dict[str, Any]],
+    stats: Sequence[Stats],
+) -> None:
+    """Writes a file of ``meta/episodes``.
+
+    Args:
+        root: The dataset.
+        number: Of the file.
+        rows: As ``episode_row`` gives them.
+        features: LeRobot's, counters left out.
+        stats: Statistics of each episode.
+    """
+    columns: dict[str, Any] = {name: [row[name] for row in rows] for name in rows[0]}
+    for name, feature in with_counters(features).items():
+        each = [of_episode[name] for of_episode in stats]
+        values = np.stack([one.values for one in each])
+        listed = {
+            stat: _lists(values[:, i], picture=is_picture(feature))
+            for i, stat in enumerate(STAT_NAMES)
+        }
+        listed["count"] = _lists(np.array([[one.count] for one in each]), picture=False)
+        columns |= {f"{STATS_PREFIX}{name}/{stat}": listed[stat] for stat in STAT_ORDER}
     chunk, file = divmod(number, FILES_A_CHUNK)
-    place = {"meta/episodes/chunk_index": chunk, "meta/episodes/file_index": file}
+    columns["meta/episodes/chunk_index"] = np.full(len(rows), chunk)
+    columns["meta/episodes/file_index"] = np.full(len(rows), file)
     path = root / numbered(EPISODES, number)
     path.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(pa.Table.from_pylist([{**row, **place} for row in rows]), path)
+    pq.write_table(pa.table(columns), path)
 
 
 def write_task(root: Path, task: str) -> None:
@@ -181,17 +200,11 @@ def write_task(root: Path, task: str) -> None:
 
 def write_stats(root: Path, features: Mapping[str, dict[str, Any]], stats: Stats) -> None:
     """Writes ``meta/stats.json``."""
-    _write_json(root / STATS, dict(named_stats(features, stats)))
-
-
-def named_stats(
-    features: Mapping[str, dict[str, Any]], stats: Stats
-) -> list[tuple[str, dict[str, Any]]]:
-    """Each feature with its statistics as LeRobot nests them, counters included."""
-    return [
-        (name, stats[name].named(picture=is_picture(feature)))
+    content = {
+        name: stats[name].named(picture=is_picture(feature))
         for name, feature in with_counters(features).items()
-    ]
+    }
+    _write_json(root / STATS, content)
 
 
 def write_info(
@@ -232,6 +245,16 @@ def _array(kind: pa.DataType, values: npt.NDArray[Any] | Sequence[bytes]) -> pa.
         return pa.FixedSizeListArray.from_arrays(pa.array(flat, kind.value_type), type=kind)
     # PyArrow narrows no float64 by itself.
     return pa.array(flat.astype(kind.to_pandas_dtype(), copy=False), kind)
+
+
+def _lists(values: npt.NDArray[Any], *, picture: bool) -> pa.Array:
+    """A list for each row of values (n, k); of pictures a list of k planes of one pixel."""
+    n, k = values.shape
+    array = pa.array(values.ravel())
+    singles = np.arange(n * k + 1, dtype=np.int32)
+    for _ in range(2 * picture):
+        array = pa.ListArray.from_arrays(singles, array)
+    return pa.ListArray.from_arrays(singles[::k], array)
 
 
 def _write_json(path: Path, content: Any) -> None:

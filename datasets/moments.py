@@ -148,10 +148,11 @@ def compare(found: Moments, listed: Mapping[str, Any], slack: float = 0.0) -> st
     if count != found.count:
         return f"count is {count}, not {found.count}"
     size = np.abs(found.mean) + np.sqrt(found.variance)
-    scale = found.rounding * np.maximum(size, np.maximum(np.abs(found.low), np.abs(found.high))) + 1e-7
-    wanted = {"mean": (found.mean, scale + slack)}
+    size = np.maximum(size, np.maximum(np.abs(found.low), np.abs(found.high)))
+    wanted = {"mean": (found.mean, found.rounding * size + 1e-7 + slack)}
     if not slack:
-        wanted |= {"min": (found.low, scale), "max": (found.high, scale)}
+        exact = _ROUNDING * size + 1e-7
+        wanted |= {"min": (found.low, exact), "max": (found.high, exact)}
     for name, (right, tolerance) in wanted.items():
         if values[name].shape != right.shape:
             return f"{name} has {values[name].size} values, not {right.size}"

@@ -142,7 +142,6 @@ class DatasetWriter:
                 episode.first,
                 episode.data_file,
                 self._task,
-                files.named_stats(self._features, stats[i]),
             )
             for i, episode in enumerate(block.episodes)
         ]
@@ -153,7 +152,7 @@ class DatasetWriter:
             before.episode_files + 1,
             {name: merge_stats([part[name] for part in parts]) for name in names},
         )
-        files.write_episodes(self._stage, before.episode_files, rows)
+        files.write_episodes(self._stage, before.episode_files, rows, self._features, stats)
         files.write_task(self._stage, self._task)
         files.write_stats(self._stage, self._features, after.stats)
         files.write_info(
