@@ -110,7 +110,8 @@ def picture_stats(
     wanted = np.array(QUANTILES)[:, None] * upto[-1]
     # A shade has a bin to itself, so the quantile's shade alone decides.
     shades = (upto < wanted[:, None]).sum(axis=1)
-    edges = _Edges(*(np.float32(255.0 * bound) for bound in (moments.low, moments.high)))
+    low, high = ((255.0 * bound).astype(np.float32) for bound in (moments.low, moments.high))
+    edges = _Edges(low, high)
     inside = np.take_along_axis(counts, shades, axis=0)
     before = np.take_along_axis(upto, shades, axis=0) - inside
     quantiles = edges.within(edges.bins(shades.astype(np.float32)), (wanted - before) / inside)
