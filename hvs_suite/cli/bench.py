@@ -44,7 +44,7 @@ class Bench:
     seconds: float = 6.0
     expert: bool = False
     recording: bool = False
-    episodes: int = 200
+    episodes: int = 600
     json: bool = False
 
     def run(self) -> None:
