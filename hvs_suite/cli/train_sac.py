@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from hvs_suite.cli import console
 
 if TYPE_CHECKING:
-    from hvs_suite.policies.sac.evaluation import Evaluation
-    from hvs_suite.policies.sac.training import Progress
+    from hvs_suite.policies.rl.evaluation import Evaluation
+    from hvs_suite.policies.rl.run import Progress
 
 DEFAULT_MINUTES = 40.0
 

@@ -12,6 +12,7 @@ from hvs_suite.policies.hvs.network import (
     IMAGE_PREFIX,
     N_JOINTS,
     POSITIONS_AND_VELOCITIES,
+    RESIDUAL_BOUND,
     Shape,
 )
 
@@ -33,6 +34,8 @@ class HvsConfig(PreTrainedConfig):
         hidden: Width of the perceptron that decides.
         error_scale: Below this, errors weigh linearly, above logarithmically: of a joint's step
             (rad) and of a place (m). Some five times the tolerance that is aimed at.
+        residual_hidden: Width of the residual that ``hvs finetune`` learns; 0 for none.
+        residual_bound: The most that it adds to the output of the head.
         keypoint_weight: Weight of the losses against the projected target and its place in space,
             where the dataset has ``privileged.*`` columns; 0 trains on actions alone.
         optimizer_lr: Peak learning rate of stock ``lerobot-train``.
@@ -49,6 +52,8 @@ class HvsConfig(PreTrainedConfig):
     channels: int = 32
     hidden: int = 256
     error_scale: float = ERROR_SCALE
+    residual_hidden: int = 0
+    residual_bound: float = RESIDUAL_BOUND
     keypoint_weight: float = 1.0
     optimizer_lr: float = 2e-3
     optimizer_weight_decay: float = 1e-4
@@ -63,6 +68,11 @@ class HvsConfig(PreTrainedConfig):
             )
         if not 0 < self.error_scale < math.inf:
             raise ValueError(f"`error_scale` must be above 0, got {self.error_scale}.")
+        if self.residual_hidden < 0 or not 0 < self.residual_bound < math.inf:
+            raise ValueError(
+                "`residual_hidden` must not be negative and `residual_bound` above 0, got "
+                f"{self.residual_hidden} and {self.residual_bound}."
+            )
         if self.keypoint_weight < 0:
             raise ValueError(f"`keypoint_weight` must not be negative, got {self.keypoint_weight}.")
         if self.n_obs_steps != 1:
@@ -104,6 +114,8 @@ class HvsConfig(PreTrainedConfig):
             self.channels,
             self.hidden,
             self.error_scale,
+            self.residual_hidden,
+            self.residual_bound,
         )
 
     def get_optimizer_preset(self) -> AdamWConfig:

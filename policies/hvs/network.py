@@ -37,6 +37,9 @@ SIGHTING_FEATURES = 5
 ERROR_SCALE = 0.005
 """Joint steps (rad) and offsets (m) are read and learned as asinh(x / this): linear below,
 logarithmic above. The default suits a tolerance of a millimetre."""
+RESIDUAL_BOUND = 0.6
+"""The most that fine-tuning may change the head's output: less than a factor of two in a joint step
+that is large, and less than two thirds of the error scale in one that is small."""
 POSITIONS_AND_VELOCITIES = 2 * N_JOINTS
 SEEN_LOGIT = 2.0
 """How sure an eye must be (as a logit) that it sees the target before its place is remembered."""
@@ -53,6 +56,8 @@ class Shape:
         channels: Channels of the encoders.
         hidden: Width of the perceptron.
         error_scale: See `ERROR_SCALE`; decides what the weights mean.
+        residual_hidden: Width of the residual that fine-tuning learns; 0 for none.
+        residual_bound: The most that it adds to the head's output.
     """
 
     cameras: Mapping[str, tuple[int, int]]
@@ -60,6 +65,8 @@ class Shape:
     channels: int
     hidden: int
     error_scale: float = ERROR_SCALE
+    residual_hidden: int = 0
+    residual_bound: float = RESIDUAL_BOUND
 
 
 def shape_from_config(config: Mapping[str, Any]) -> Shape:
@@ -87,6 +94,8 @@ def shape_from_config(config: Mapping[str, Any]) -> Shape:
         int(config["channels"]),
         int(config["hidden"]),
         float(config["error_scale"]),
+        int(config.get("residual_hidden", 0)),
+        float(config.get("residual_bound", RESIDUAL_BOUND)),
     )
 
 
@@ -118,7 +127,8 @@ class Decision:
     """What the network makes of one observation.
 
     Attributes:
-        out: The head's output, (B, 7), see `HvsNetwork.to_action`.
+        out: What the network says, (B, 7), see `HvsNetwork.to_action`.
+        features: What a residual reads, (B, n): the head's inputs, and what the head alone says.
         sightings: Camera name to what it saw.
         target: Where the target is taken to be, (B, 3) m in the base frame; None without joints.
         memory: What to remember for the next observation, (B, 4); None without joints.
@@ -126,6 +136,7 @@ class Decision:
     """
 
     out: Tensor
+    features: Tensor
     sightings: dict[str, Sighting]
     target: Tensor | None
     memory: Tensor | None
@@ -306,6 +317,10 @@ class HvsNetwork(nn.Module):
             last,
         )
         self.step_gain = nn.Parameter(torch.full((N_JOINTS,), 0.5))
+        self.n_features = width + N_JOINTS
+        self.residual = (
+            make_residual(self.n_features, shape.residual_hidden) if shape.residual_hidden else None
+        )
 
     def set_calibration(self, calibration: Calibration) -> None:
         """Copy camera maps and surface into the buffers that are saved with the weights."""
@@ -354,8 +369,8 @@ class HvsNetwork(nn.Module):
         sightings = self.look(images)
         features = [s.features() for s in sightings.values()]
         if state is None:
-            out = self.head(torch.cat(features, dim=1))
-            return Decision(out, sightings, None, None, None)
+            out, known = self._say(features, 0.0)
+            return Decision(out, known, sightings, None, None, None)
         q = state[:, :N_JOINTS]
         if memory is None:
             memory = state.new_zeros(len(state), MEMORY_SIZE)
@@ -378,8 +393,17 @@ class HvsNetwork(nn.Module):
             offset = estimate[:, :3] + lift - motion.position
             in_flange = (offset[:, None] @ motion.rotation)[:, 0]
             features += [offset, torch.asinh(in_flange / scale), estimate[:, 3:]]
-        out = self.head(torch.cat(features, dim=1)) + self.step_gain * step
-        return Decision(out, sightings, target, remembered, motion)
+        out, known = self._say(features, self.step_gain * step)
+        return Decision(out, known, sightings, target, remembered, motion)
+
+    def _say(self, features: list[Tensor], step: Tensor | float) -> tuple[Tensor, Tensor]:
+        """The output, and the features that a residual reads."""
+        inputs = torch.cat(features, dim=1)
+        out = self.head(inputs) + step
+        known = torch.cat([inputs, out], dim=1)
+        if self.residual is not None:
+            out = out + self.shape.residual_bound * self.residual(known)
+        return out, known
 
     def _place(
         self, motion: geometry.FlangeMotion, sightings: Mapping[str, Sighting], memory: Tensor
@@ -455,6 +479,30 @@ class HvsNetwork(nn.Module):
             return action
         step = action * self.joint_range - state[:, :N_JOINTS]
         return torch.asinh(step / self.shape.error_scale)
+
+
+def make_residual(n_features: int, hidden: int) -> nn.Sequential:
+    """What fine-tuning adds to the head: features (B, n) to shares of the bound, (B, 7) in [-1, 1].
+
+    Nothing at first: its last layer begins at zero.
+
+    Args:
+        n_features: Numbers that it reads.
+        hidden: Width of its layers.
+    """
+    last = nn.Linear(hidden, N_JOINTS)
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)
+    return nn.Sequential(
+        nn.Linear(n_features, hidden),
+        nn.LayerNorm(hidden),
+        nn.ReLU(),
+        nn.Linear(hidden, hidden),
+        nn.LayerNorm(hidden),
+        nn.ReLU(),
+        last,
+        nn.Tanh(),
+    )
 
 
 def action_loss(out: Tensor, label: Tensor) -> Tensor:

@@ -264,7 +264,7 @@ def test_a_damaged_state_is_refused_and_another_seed_too(whole, tmp_path):
         train_sac("align-easy", out, steps=STEPS, seed=4, **OPTIONS)
     train_sac("align-easy", tmp_path / "out", steps=6, **OPTIONS)
     (tmp_path / "out" / "training" / "replay" / "0000000000-0000000006.npz").unlink()
-    with pytest.raises(OutputError, match="transitions 0 to 5 are missing"):
+    with pytest.raises(OutputError, match="rows 0 to 5 are missing"):
         train_sac("align-easy", tmp_path / "out", steps=12, **OPTIONS)
 
 

@@ -1,4 +1,4 @@
-"""The environment that SAC learns in, which can be put back into the middle of an episode.
+"""The environment that RL learns in, which can be put back into the middle of an episode.
 
 A scene is a function of its index, and physics of scene and actions: the number of the episode and
 the actions since its reset are all there is to keep.
@@ -30,20 +30,34 @@ OUTCOMES = (
 class Journal(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Plays one scene of a split after the other, and remembers how it got where it is.
 
-    Attributes:
-        episode: Number of the episode that is being played.
-        actions: Those given since its reset, (7,) each.
-
     Args:
         env: Takes ``options={"scenario": i}`` in ``reset``.
         seed: Of the run; below 2^32.
+        part: Which of the run's environments this is.
+        parts: How many the run has; they share its scenes between them.
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any], seed: int) -> None:
+    def __init__(
+        self, env: gymnasium.Env[Any, Any], seed: int, part: int = 0, parts: int = 1
+    ) -> None:
         super().__init__(env)
-        self._first = seed * SCENES_A_SEED
-        self.episode = 0
-        self.actions: list[npt.NDArray[np.float32]] = []
+        self._first = seed * SCENES_A_SEED + part
+        self._parts = parts
+        self._episode = 0
+        self._actions: list[npt.NDArray[np.float32]] = []
+
+    def place(self) -> dict[str, Any]:
+        """Where it is, as JSON has it: the episode's number, and the actions since its reset."""
+        return {"episode": self._episode, "actions": [a.tolist() for a in self._actions]}
+
+    def go_to(self, place: Mapping[str, Any]) -> None:
+        """Let the next reset lead to where `place` said that it was.
+
+        Args:
+            place: As `place` gave it.
+        """
+        self._episode = int(place["episode"])
+        self._actions = [np.array(action, np.float32) for action in place["actions"]]
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -54,19 +68,19 @@ class Journal(gymnasium.Wrapper[Any, Any, Any, Any]):
             seed: Not used; the scenes are the run's own.
             options: Not used.
         """
-        scene = {"scenario": self._first + self.episode}
+        scene = {"scenario": self._first + self._parts * self._episode}
         observation, info = self.env.reset(options=scene)
-        for action in self.actions:
+        for action in self._actions:
             observation, _, _, _, info = self.env.step(action)
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Plays one control step and notes it down."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self.actions.append(np.array(action, np.float32))
+        self._actions.append(np.array(action, np.float32))
         if terminated or truncated:
-            self.episode += 1
-            self.actions = []
+            self._episode += 1
+            self._actions = []
         return observation, reward, terminated, truncated, info
 
 

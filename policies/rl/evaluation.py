@@ -1,8 +1,8 @@
-"""How an actor stands amid its training: a few scenes of their own split, and a clip."""
+"""How a policy stands amid its training: a few scenes of their own split, and a clip."""
 
 import dataclasses
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,7 @@ from hvs_suite.files import replacing
 from hvs_suite.pictures import film_episode, write_film
 from hvs_suite.registry import load
 from hvs_suite.rollout import Policy, run_episode
+from hvs_suite.statistics import wilson_interval
 from hvs_suite.tasks.variants import AlignVariant
 
 if TYPE_CHECKING:
@@ -140,3 +141,20 @@ def write_evaluations(path: Path, evaluations: list[Evaluation]) -> None:
     with replacing(path) as temporary:
         rows = [dataclasses.asdict(row) for row in evaluations]
         temporary.write_text(json.dumps(rows, indent=2) + "\n")
+
+
+def fallen(evaluations: Sequence[Evaluation]) -> bool:
+    """Whether the last evaluation is worse than an earlier one beyond chance.
+
+    That is where Wilson's 95 % intervals of their success rates lie apart.
+
+    Args:
+        evaluations: In order.
+    """
+    if not evaluations:
+        return False
+    ranges = [
+        wilson_interval(round(each.success_rate * each.episodes), each.episodes)
+        for each in evaluations
+    ]
+    return ranges[-1][1] < max(low for low, _ in ranges)

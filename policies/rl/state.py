@@ -1,7 +1,7 @@
-"""Everything that SAC needs to go on after a kill, without pickle, which SB3's own format is.
+"""Everything that an SB3 run needs to go on after a kill, without pickle, which SB3's format is.
 
 ``state.safetensors`` holds networks and optimisers, with counters and random states as JSON in its
-header: one file, replaced in one step. Transitions are only ever added, so that each checkpoint
+header: one file, replaced in one step. Rows are only ever added, so that each checkpoint
 writes those since the last one, as ``replay/<first>-<end>.npz``, and drops what the memory forgot.
 """
 
@@ -16,17 +16,18 @@ import numpy.typing as npt
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from stable_baselines3 import SAC
+from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.buffers import DictReplayBuffer
 from torch import Tensor
 
 from hvs_suite.errors import OutputError
 from hvs_suite.files import replacing
-from hvs_suite.policies.sac.journal import Journal
 
 STATE = "state.safetensors"
 REPLAY = "replay"
 Rows = dict[str, npt.NDArray[Any]]
+Model = SAC | TD3
+"""Learns in one or several environments, each a `Journal`."""
 
 
 @dataclasses.dataclass
@@ -35,23 +36,24 @@ class Counters:
 
     Attributes:
         elapsed_s: Time spent playing and learning over all sittings (s).
-        stored: Transitions that went into the replay memory, forgotten ones included.
+        stored: Rows that went into the replay memory, forgotten ones included; a row holds one
+            transition of each environment.
     """
 
     elapsed_s: float = 0.0
     stored: int = 0
 
 
-def save_run(folder: Path, model: SAC, journal: Journal, counters: Counters) -> None:
+def save_run(folder: Path, model: Model, counters: Counters) -> None:
     """Write the state of a run; call it between two iterations.
 
     Args:
         folder: Where the state lives.
-        model: Networks, optimisers, replay memory and counters.
-        journal: Where the episode stands.
-        counters: Gets the transitions that are now stored.
+        model: Networks, optimisers, replay memory, counters and environments.
+        counters: Gets the rows that are now stored.
     """
-    stored = model.num_timesteps
+    assert model.env is not None
+    stored = model.num_timesteps // model.n_envs
     _save_rows(folder / REPLAY, _memory(model), counters.stored, stored)
     counters.stored = stored
     rng = np.random.get_state()  # noqa: NPY002 - SB3 draws batches from this generator
@@ -62,8 +64,7 @@ def save_run(folder: Path, model: SAC, journal: Journal, counters: Counters) -> 
         "env_steps": model.num_timesteps,
         "updates": model._n_updates,
         "episodes": model._episode_num,
-        "episode": journal.episode,
-        "actions": [action.tolist() for action in journal.actions],
+        "places": model.env.env_method("place"),
         "recent": list(model.ep_info_buffer or ()),
         "recent_success": list(model.ep_success_buffer or ()),
         "numpy_rng": [rng[0], rng[1].tolist(), *rng[2:]],
@@ -75,13 +76,13 @@ def save_run(folder: Path, model: SAC, journal: Journal, counters: Counters) -> 
     _forget_rows(folder / REPLAY, stored, _memory(model).buffer_size)
 
 
-def load_run(folder: Path, model: SAC, journal: Journal) -> Counters:
+def load_run(folder: Path, model: Model) -> Counters:
     """Put a run back to where it was saved; a folder without a state is a run not begun.
 
     Args:
         folder: As given to `save_run`.
-        model: Of the same settings, fresh.
-        journal: Fresh; its next reset leads into the middle of the episode.
+        model: Of the same settings, fresh; the next reset of its environments leads into the
+            middle of their episodes.
 
     Returns:
         How far the run had come.
@@ -103,8 +104,9 @@ def load_run(folder: Path, model: SAC, journal: Journal) -> Counters:
         window = model._stats_window_size
         model.ep_info_buffer = deque(header["recent"], maxlen=window)
         model.ep_success_buffer = deque(header["recent_success"], maxlen=window)
-        journal.episode = int(header["episode"])
-        journal.actions = [np.array(action, np.float32) for action in header["actions"]]
+        assert model.env is not None
+        for part, place in enumerate(header["places"]):
+            model.env.env_method("go_to", place, indices=part)
         name, key, *rest = header["numpy_rng"]
         np.random.set_state((name, np.array(key, np.uint32), *rest))  # noqa: NPY002
         torch.set_rng_state(tensors["torch_rng"])
@@ -117,32 +119,31 @@ def load_run(folder: Path, model: SAC, journal: Journal) -> Counters:
     return counters
 
 
-def _memory(model: SAC) -> DictReplayBuffer:
+def _memory(model: Model) -> DictReplayBuffer:
     assert isinstance(model.replay_buffer, DictReplayBuffer)
     return model.replay_buffer
 
 
-def _optimizers(model: SAC) -> dict[str, torch.optim.Optimizer]:
-    assert model.ent_coef_optimizer is not None
-    return {
-        "actor": model.actor.optimizer,
-        "critic": model.critic.optimizer,
-        "temperature": model.ent_coef_optimizer,
-    }
+def _optimizers(model: Model) -> dict[str, torch.optim.Optimizer]:
+    found = {"actor": model.actor.optimizer, "critic": model.critic.optimizer}
+    if isinstance(model, SAC) and model.ent_coef_optimizer is not None:
+        found["temperature"] = model.ent_coef_optimizer
+    return found
 
 
-def _tensors(model: SAC) -> dict[str, Tensor]:
+def _tensors(model: Model) -> dict[str, Tensor]:
     """Networks, optimiser moments, temperature and torch's random state, by name."""
     tensors = {f"policy/{name}": value for name, value in model.policy.state_dict().items()}
     for which, optimizer in _optimizers(model).items():
         for index, moments in optimizer.state_dict()["state"].items():
             for name, value in moments.items():
                 tensors[f"{which}/{index}/{name}"] = value
-    assert model.log_ent_coef is not None
-    return {**tensors, "log_ent_coef": model.log_ent_coef, "torch_rng": torch.get_rng_state()}
+    if isinstance(model, SAC) and model.log_ent_coef is not None:
+        tensors["log_ent_coef"] = model.log_ent_coef
+    return {**tensors, "torch_rng": torch.get_rng_state()}
 
 
-def _put_tensors(model: SAC, tensors: dict[str, Tensor]) -> None:
+def _put_tensors(model: Model, tensors: dict[str, Tensor]) -> None:
     prefix = "policy/"
     model.policy.load_state_dict(
         {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
@@ -155,13 +156,13 @@ def _put_tensors(model: SAC, tensors: dict[str, Tensor]) -> None:
                 moments.setdefault(int(index), {})[name] = value
         groups = optimizer.state_dict()["param_groups"]
         optimizer.load_state_dict({"state": moments, "param_groups": groups})
-    assert model.log_ent_coef is not None
-    with torch.no_grad():
-        model.log_ent_coef.copy_(tensors["log_ent_coef"])
+    if isinstance(model, SAC) and model.log_ent_coef is not None:
+        with torch.no_grad():
+            model.log_ent_coef.copy_(tensors["log_ent_coef"])
 
 
 def _arrays(memory: DictReplayBuffer) -> Rows:
-    """The memory's own arrays by name, (capacity, 1, ...) each."""
+    """The memory's own arrays by name, (capacity, environments, ...) each."""
     arrays: Rows = {
         name: getattr(memory, name) for name in ("actions", "rewards", "dones", "timeouts")
     }
@@ -172,7 +173,7 @@ def _arrays(memory: DictReplayBuffer) -> Rows:
 
 
 def _save_rows(folder: Path, memory: DictReplayBuffer, first: int, end: int) -> None:
-    """Write transitions ``first`` to ``end`` - 1 of a run, as far as the memory has them."""
+    """Write rows ``first`` to ``end`` - 1 of a run, as far as the memory has them."""
     first = max(first, end - memory.buffer_size)
     if first == end:
         return
@@ -183,7 +184,7 @@ def _save_rows(folder: Path, memory: DictReplayBuffer, first: int, end: int) -> 
 
 
 def _load_rows(folder: Path, memory: DictReplayBuffer, stored: int) -> None:
-    """Fill the memory with the last transitions of a run, and remove what a kill left beyond."""
+    """Fill the memory with the last rows of a run, and remove what a kill left beyond."""
     wanted = max(0, stored - memory.buffer_size)
     arrays = _arrays(memory)
     for path, first, end in _shards(folder):
@@ -201,7 +202,7 @@ def _load_rows(folder: Path, memory: DictReplayBuffer, stored: int) -> None:
                 array[rows[kept] % memory.buffer_size] = content[name][kept]
         wanted = end
     if wanted != stored:
-        raise ValueError(f"transitions {wanted} to {stored - 1} are missing")
+        raise ValueError(f"rows {wanted} to {stored - 1} are missing")
     memory.pos = stored % memory.buffer_size
     memory.full = stored >= memory.buffer_size
 
@@ -213,7 +214,7 @@ def _forget_rows(folder: Path, stored: int, capacity: int) -> None:
 
 
 def _shards(folder: Path) -> list[tuple[Path, int, int]]:
-    """Files of transitions in order, each with its first and the one after its last."""
+    """Files of rows in order, each with its first and the one after its last."""
     found = []
     for path in sorted(folder.glob("[0-9]*-[0-9]*.npz")):
         first, _, end = path.stem.partition("-")

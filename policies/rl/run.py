@@ -1,0 +1,277 @@
+"""One sitting of an RL run: SB3's iterations, with evaluations, checkpoints and curves in between.
+
+Killed, a run goes on from its last checkpoint when the same command is given again, and ends like
+one that was left alone.
+"""
+
+import dataclasses
+import json
+import math
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+from stable_baselines3.common.logger import Logger
+
+from hvs_suite.errors import OptionError
+from hvs_suite.files import replacing
+from hvs_suite.policies.rl.curves import Curves
+from hvs_suite.policies.rl.evaluation import (
+    Evaluation,
+    Examiner,
+    fallen,
+    read_evaluations,
+    write_evaluations,
+)
+from hvs_suite.policies.rl.journal import OUTCOMES
+from hvs_suite.policies.rl.state import Counters, Model, load_run, save_run
+from hvs_suite.rollout import Policy
+
+LOG_EVERY = 10
+"""Iterations between two points of a curve."""
+
+
+class Learner(Protocol):
+    """What the algorithms differ in.
+
+    Attributes:
+        stops_when_fallen: End the run where success has fallen below what it was, keeping what
+            plays as it was before.
+    """
+
+    stops_when_fallen: bool
+
+    @property
+    def model(self) -> Model:
+        """SB3's, its environments journals."""
+
+    def policy(self) -> Policy:
+        """What the model has learnt so far, without exploration."""
+
+    def keep(self) -> None:
+        """Write what `policy` made into the run's folder, to be played from there."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Progress:
+    """How a run is doing.
+
+    Attributes:
+        stage: ``training``, ``evaluating``, or what comes before them.
+        share: Part of the stage that is done, 0 to 1.
+        env_steps: Environment steps over all sittings.
+        updates: Updates over all sittings.
+        env_steps_per_s: Rate in this sitting, evaluations not counted.
+        seconds_left: Of the budget, at the rate of this sitting (s).
+        episode_return: Mean of the last hundred episodes; NaN before the first has ended.
+        evaluation: The last one; None before.
+    """
+
+    stage: str
+    share: float
+    env_steps: int
+    updates: int
+    env_steps_per_s: float
+    seconds_left: float
+    episode_return: float
+    evaluation: Evaluation | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What a run came to; also in ``training/outcome.json``.
+
+    Attributes:
+        step: Updates, over all sittings.
+        env_steps: Environment steps, over all sittings.
+        updates_per_env_step: Their ratio.
+        episodes: Episodes ended.
+        train_s: Time spent playing and learning over all sittings, evaluations not counted (s).
+        env_steps_per_s: Rate over all sittings.
+        n_parameters: Trainable numbers of the actor.
+        evaluation: The last one.
+        has_fallen: The run was ended because success fell; what plays is from before.
+    """
+
+    step: int
+    env_steps: int
+    updates_per_env_step: float
+    episodes: int
+    train_s: float
+    env_steps_per_s: float
+    n_parameters: int
+    evaluation: Evaluation | None
+    has_fallen: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Budget:
+    """How long to train: environment steps, minutes, or whichever is reached first.
+
+    Raises:
+        OptionError: Neither is given, or one makes no sense.
+    """
+
+    steps: int | None
+    minutes: float | None
+
+    def __post_init__(self) -> None:
+        """Refuse what is no budget."""
+        if self.minutes is None and self.steps is None:
+            raise OptionError("say how long to train: give minutes or steps")
+        for name, value in (("minutes", self.minutes), ("steps", self.steps)):
+            if value is not None and not (value > 0 and math.isfinite(value)):
+                raise OptionError(f"{name} must be above 0, not {value}")
+
+    def share(self, env_steps: int, elapsed_s: float) -> float:
+        """Part that is used up, 1 at the end."""
+        shares = [0.0]
+        if self.steps is not None:
+            shares.append(env_steps / self.steps)
+        if self.minutes is not None:
+            shares.append(elapsed_s / (60.0 * self.minutes))
+        return max(shares)
+
+
+class Run:
+    """One sitting.
+
+    Args:
+        out: Folder of the run; its state lives in ``out/training``.
+        learner: What learns.
+        examiner: Evaluates it.
+        on_progress: Called after every iteration and every episode of an evaluation.
+    """
+
+    def __init__(
+        self,
+        out: Path,
+        learner: Learner,
+        examiner: Examiner,
+        on_progress: Callable[[Progress], None] | None,
+    ) -> None:
+        self._training = out / "training"
+        self._learner = learner
+        self._model = model = learner.model
+        self._examiner = examiner
+        self._on_progress = on_progress
+        self._counters: Counters = load_run(self._training, model)
+        self._begun = (model.num_timesteps, self._counters.elapsed_s)
+        self._evaluations = read_evaluations(
+            self._training / "evaluations.json", model.num_timesteps
+        )
+        self._curves = Curves(self._training / "tensorboard", model.num_timesteps)
+        model.set_logger(Logger(None, [self._curves]))
+
+    def close(self) -> None:
+        """Close the curves."""
+        self._curves.close()
+
+    def train(
+        self, budget: Budget, collect_steps: int, eval_every: int, checkpoint_period_s: float
+    ) -> None:
+        """Train until the budget is used up, or success has fallen.
+
+        Args:
+            budget: How long.
+            collect_steps: Environment steps an iteration.
+            eval_every: Environment steps between evaluations; one more comes at start and end.
+            checkpoint_period_s: Time between checkpoints (s).
+        """
+        model, counters = self._model, self._counters
+        begun = share = budget.share(model.num_timesteps, counters.elapsed_s)
+        if not self._evaluations:
+            self._evaluate()
+            self._checkpoint()
+        last_checkpoint = time.perf_counter()
+        iterations = 0
+        while share < 1.0 and not self._has_fallen():
+            started = time.perf_counter()
+            # One iteration: SB3 collects `collect_steps` steps, then updates.
+            model.learn(collect_steps, log_interval=sys.maxsize, reset_num_timesteps=False)
+            counters.elapsed_s += time.perf_counter() - started
+            iterations += 1
+            share = budget.share(model.num_timesteps, counters.elapsed_s)
+            if iterations % LOG_EVERY == 0 or share >= 1.0:
+                self._log()
+            evaluated = self._evaluations[-1].env_steps
+            due = model.num_timesteps // eval_every > evaluated // eval_every
+            if due or (share >= 1.0 and evaluated < model.num_timesteps):
+                self._evaluate()
+                last_checkpoint = -math.inf
+            if time.perf_counter() - last_checkpoint >= checkpoint_period_s:
+                self._checkpoint()
+                last_checkpoint = time.perf_counter()
+            used = (share - begun) / max(1e-9, counters.elapsed_s - self._begun[1])
+            self._report("training", share, max(0.0, 1.0 - share) / max(1e-12, used))
+
+    def outcome(self) -> Outcome:
+        """What the run has come to."""
+        env_steps, updates = self._model.num_timesteps, self._model._n_updates
+        return Outcome(
+            step=updates,
+            env_steps=env_steps,
+            updates_per_env_step=updates / max(1, env_steps),
+            episodes=self._model._episode_num,
+            train_s=self._counters.elapsed_s,
+            env_steps_per_s=env_steps / max(1e-9, self._counters.elapsed_s),
+            n_parameters=sum(p.numel() for p in self._model.actor.parameters()),
+            evaluation=self._evaluations[-1] if self._evaluations else None,
+            has_fallen=self._has_fallen(),
+        )
+
+    def _has_fallen(self) -> bool:
+        return self._learner.stops_when_fallen and fallen(self._evaluations)
+
+    def _evaluate(self) -> None:
+        """Play greedily, film scene 0, keep the figures, and the policy if it is good."""
+        env_steps = self._model.num_timesteps
+        evaluation = self._examiner.evaluate(
+            self._learner.policy(),
+            env_steps,
+            self._model._n_updates,
+            self._training / "clips" / f"{env_steps:010d}.mp4",
+            lambda done: self._report("evaluating", done / self._examiner.episodes, 0.0),
+        )
+        self._evaluations.append(evaluation)
+        write_evaluations(self._training / "evaluations.json", self._evaluations)
+        self._curves.add({f"eval/{k}": v for k, v in evaluation.figures().items()}, env_steps)
+        if not self._has_fallen():
+            self._learner.keep()
+
+    def _checkpoint(self) -> None:
+        save_run(self._training, self._model, self._counters)
+        with replacing(self._training / "outcome.json") as temporary:
+            temporary.write_text(json.dumps(dataclasses.asdict(self.outcome()), indent=2) + "\n")
+
+    def _log(self) -> None:
+        """Points of all curves: SB3's own, and what it does not know of our episodes."""
+        model = self._model
+        recent = list(model.ep_info_buffer or ())
+        for name in OUTCOMES if recent else ():
+            value = sum(float(episode[name]) for episode in recent) / len(recent)
+            model.logger.record(f"rollout/{name}", value)
+        model.logger.record(
+            "train/updates_per_env_step", model._n_updates / max(1, model.num_timesteps)
+        )
+        model.dump_logs()
+
+    def _report(self, stage: str, share: float, seconds_left: float) -> None:
+        if self._on_progress is None:
+            return
+        recent = [float(episode["r"]) for episode in self._model.ep_info_buffer or ()]
+        steps = self._model.num_timesteps - self._begun[0]
+        self._on_progress(
+            Progress(
+                stage=stage,
+                share=share,
+                env_steps=self._model.num_timesteps,
+                updates=self._model._n_updates,
+                env_steps_per_s=steps / max(1e-9, self._counters.elapsed_s - self._begun[1]),
+                seconds_left=seconds_left,
+                episode_return=sum(recent) / len(recent) if recent else math.nan,
+                evaluation=self._evaluations[-1] if self._evaluations else None,
+            )
+        )
