@@ -328,7 +328,7 @@ def _play_in_processes(job: _Job, scenarios: list[int], workers: int) -> Generat
         ) from error
     started: list[tuple[SpawnProcess, Connection]] = []
     try:
-        with _start_conditions():
+        with worker_conditions():
             for _ in range(workers):
                 started.append(_start_worker(job))
         processes = {connection: process for process, connection in started}
@@ -361,7 +361,7 @@ def _play_in_processes(job: _Job, scenarios: list[int], workers: int) -> Generat
 
 
 @contextlib.contextmanager
-def _start_conditions() -> Iterator[None]:
+def worker_conditions() -> Iterator[None]:
     """Environment variables and signals as a new worker shall inherit them.
 
     A worker ignores Ctrl-C from its first instruction on: the terminal sends it to the whole

@@ -35,20 +35,32 @@ def policy_factory(spec: str, task: str) -> PolicyFactory:
     find(task)
     if spec in BUILTIN:
         return _builtin(spec)
+    if imported.NAME.fullmatch(spec):
+        return imported.imported_factory(spec)
+    return _checkpoint(checkpoint_folder(spec, task), task)
+
+
+def checkpoint_folder(spec: str, task: str) -> Path:
+    """Find a checkpoint for a task.
+
+    Args:
+        spec: ``pretrained`` or ``finetuned``, a folder, or a Hub id, which is fetched.
+        task: Named task.
+
+    Raises:
+        PolicyError: There is no such checkpoint.
+    """
     if spec in SHIPPED:
         folder = HERE / spec / trained_on(task)
         if not folder.is_dir():
             raise PolicyError(
                 f"this version ships no {spec} weights for {task}; train your own with hvs pretrain"
             )
-        return _checkpoint(folder, task)
-    folder = Path(spec)
-    if imported.NAME.fullmatch(spec):
-        return imported.imported_factory(spec)
-    if folder.is_dir():
-        return _checkpoint(folder, task)
+        return folder
+    if Path(spec).is_dir():
+        return Path(spec)
     if hub.NAME.fullmatch(spec):
-        return _checkpoint(hub.fetch(spec), task)
+        return hub.fetch(spec)
     close = difflib.get_close_matches(spec, NAMES, n=1)
     hint = (
         f"did you mean {close[0]}?"

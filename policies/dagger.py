@@ -55,7 +55,7 @@ class CorrectedEpisode:
 
     Attributes:
         scenario: Index in the split.
-        frames: One a control step, with the expert's ``action``.
+        frames: One a control step, with the expert's ``action`` where it was asked.
         success: The goal was reached.
         collision: A forbidden contact ended it.
     """
@@ -64,6 +64,20 @@ class CorrectedEpisode:
     frames: list[Frame]
     success: bool
     collision: bool
+
+
+def watch(env: "Environment", policy: Policy, scenario: int) -> CorrectedEpisode:
+    """Play one scenario with the policy and keep what it saw, asking no expert.
+
+    Args:
+        env: The task.
+        policy: Who plays.
+        scenario: Index in the split.
+
+    Returns:
+        The episode, its frames without ``action``.
+    """
+    return _played(env, policy, scenario, dict)
 
 
 def correct(env: "Environment", policy: Policy, scenario: int) -> CorrectedEpisode:
@@ -78,12 +92,18 @@ def correct(env: "Environment", policy: Policy, scenario: int) -> CorrectedEpiso
         The episode.
     """
     expert = Demonstrator(env)
+    return _played(env, policy, scenario, lambda: {ACTION: expert.label()})
+
+
+def _played(
+    env: "Environment", policy: Policy, scenario: int, label: Callable[[], Frame]
+) -> CorrectedEpisode:
     time_step = env.reset(scenario=scenario)
     policy.reset()
     frames: list[Frame] = []
     while not time_step.last():
         frame = observed_part(env.variant, time_step.observation, env)
-        frames.append(frame | {ACTION: expert.label()})
+        frames.append(frame | label())
         action = np.clip(policy.select_action(time_step.observation), -1.0, 1.0)
         time_step = env.step(action.astype(np.float32))
     info = env.info
@@ -119,6 +139,7 @@ def play_round(
     frames: int,
     first_scenario: int,
     workers: int,
+    labelled: bool = True,
     on_frames: Callable[[int], None] | None = None,
 ) -> RoundSummary:
     """Play scenarios until enough frames are there, and keep them on disk.
@@ -130,6 +151,7 @@ def play_round(
         frames: How many to keep.
         first_scenario: Index to begin with; give one that the dataset does not hold.
         workers: Processes that play. The result is the same for any number.
+        labelled: Ask the expert at every step what it would have done.
         on_frames: Called with the number of frames just kept.
 
     Returns:
@@ -139,13 +161,15 @@ def play_round(
         OutputError: The folder cannot be written.
     """
     scratch = folder.with_name(f".{folder.name}")
-    keys = {key: manifest.features[key] for key in manifest.trained_keys}
+    keys = {
+        key: manifest.features[key] for key in manifest.trained_keys if labelled or key != ACTION
+    }
     played = play(
         MakeEnvironment(manifest.task, manifest.split, dict(manifest.options)),
         CheckpointFactory(str(checkpoint.resolve())),
         # No episode is without a frame, so these are enough.
         range(first_scenario, first_scenario + frames),
-        correct,
+        correct if labelled else watch,
         workers=workers,
     )
     try:

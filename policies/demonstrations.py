@@ -161,69 +161,37 @@ def refuse_test_split(manifest: Manifest) -> None:
         )
 
 
-class Demonstrations:
-    """Frames and labels of one dataset, and of what was added to it.
+class FramePool:
+    """Recordings to draw batches from.
 
     Args:
-        manifest: Of the dataset.
-        cache: Folder for decoded frames.
-        seed: Chooses the held-out episodes.
-        episodes: Learn from the first so many alone; None from all.
-        on_frames: Called with the number of frames just decoded, over all cameras.
+        manifest: What they were recorded on.
+        seed: Of the errors in what a policy would remember.
 
     Attributes:
         manifest: As given.
-        training: Indices of the frames to learn from.
-        held_out: Indices of the frames of held-out episodes; empty for a single episode.
-
-    Raises:
-        DatasetError: The dataset lacks what training needs.
     """
 
-    def __init__(
-        self,
-        manifest: Manifest,
-        cache: Path,
-        seed: int,
-        *,
-        episodes: int | None = None,
-        on_frames: OnFrames | None = None,
-    ) -> None:
+    def __init__(self, manifest: Manifest, seed: int) -> None:
         self.manifest = manifest
-        columns = _read_columns(manifest)
-        images: dict[str, Frames] = {}
-        for name, shape in manifest.cameras.items():
-            key = IMAGE_PREFIX + name
-            if manifest.features[key]["dtype"] != "image":
-                raise DatasetError(
-                    f"{manifest.root}: {key} is video; train on the lossless recording instead"
-                )
-            images[key] = cached_frames(
-                manifest.root, key, shape, manifest.n_frames, cache, on_frames
-            )
         self._seed = seed
-        self._recordings = [self._with_memory(Recording(columns, images), 0)]
-        self._starts = np.array([0])
-        owner = columns[EPISODE]
-        names = np.unique(owner)[:episodes]
-        stream = np.random.Generator(np.random.Philox(key=[seed, HELD_OUT_STREAM]))
-        n_held_out = max(1, round(HELD_OUT_SHARE * len(names))) if len(names) > 1 else 0
-        shuffled = stream.permutation(names)
-        self.training = np.flatnonzero(np.isin(owner, shuffled[n_held_out:]))
-        self.held_out = np.flatnonzero(np.isin(owner, shuffled[:n_held_out]))
+        self._recordings: list[Recording] = []
+        self._starts: npt.NDArray[np.int64] = np.zeros(0, np.int64)
+        self._length = 0
+
+    def __len__(self) -> int:
+        """Frames."""
+        return self._length
 
     def add(self, recording: Recording) -> None:
-        """Learn from more frames, all of them.
+        """Take in more frames.
 
         Args:
             recording: The frames, with the same keys.
         """
-        last = self._recordings[-1]
-        start = self._starts[-1] + len(last.columns[EPISODE])
-        more = np.arange(start, start + len(recording.columns[EPISODE]))
         self._recordings.append(self._with_memory(recording, len(self._recordings)))
-        self._starts = np.append(self._starts, start)
-        self.training = np.concatenate([self.training, more])
+        self._starts = np.append(self._starts, self._length)
+        self._length += len(recording.columns[EPISODE])
 
     def _with_memory(self, recording: Recording, number: int) -> Recording:
         """Add what a policy would remember at each frame, where the columns tell."""
@@ -243,8 +211,7 @@ class Demonstrations:
             indices: Of the frames, (B,).
 
         Returns:
-            Images (B, C, H, W) uint8, and float32 the columns of `_read_columns` and
-            ``memory`` (B, 4).
+            Images (B, C, H, W) uint8, and float32 the recordings' columns and ``memory`` (B, 4).
         """
         # Neighbours on disk together: the same rows, fewer page faults.
         indices = np.sort(indices)
@@ -270,6 +237,65 @@ class Demonstrations:
             # (B, H, W, C) stays the layout in memory, which is what the convolutions want.
             batch[key] = images.permute(0, 3, 1, 2)
         return batch
+
+
+class Demonstrations(FramePool):
+    """Frames and labels of one dataset, and of what was added to it.
+
+    Args:
+        manifest: Of the dataset.
+        cache: Folder for decoded frames.
+        seed: Chooses the held-out episodes.
+        episodes: Learn from the first so many alone; None from all.
+        on_frames: Called with the number of frames just decoded, over all cameras.
+
+    Attributes:
+        training: Indices of the frames to learn from.
+        held_out: Indices of the frames of held-out episodes; empty for a single episode.
+
+    Raises:
+        DatasetError: The dataset lacks what training needs.
+    """
+
+    def __init__(
+        self,
+        manifest: Manifest,
+        cache: Path,
+        seed: int,
+        *,
+        episodes: int | None = None,
+        on_frames: OnFrames | None = None,
+    ) -> None:
+        super().__init__(manifest, seed)
+        columns = _read_columns(manifest)
+        images: dict[str, Frames] = {}
+        for name, shape in manifest.cameras.items():
+            key = IMAGE_PREFIX + name
+            if manifest.features[key]["dtype"] != "image":
+                raise DatasetError(
+                    f"{manifest.root}: {key} is video; train on the lossless recording instead"
+                )
+            images[key] = cached_frames(
+                manifest.root, key, shape, manifest.n_frames, cache, on_frames
+            )
+        super().add(Recording(columns, images))
+        owner = columns[EPISODE]
+        names = np.unique(owner)[:episodes]
+        stream = np.random.Generator(np.random.Philox(key=[seed, HELD_OUT_STREAM]))
+        n_held_out = max(1, round(HELD_OUT_SHARE * len(names))) if len(names) > 1 else 0
+        shuffled = stream.permutation(names)
+        self.training = np.flatnonzero(np.isin(owner, shuffled[n_held_out:]))
+        self.held_out = np.flatnonzero(np.isin(owner, shuffled[:n_held_out]))
+
+    def add(self, recording: Recording) -> None:
+        """Learn from more frames, all of them.
+
+        Args:
+            recording: The frames, with the same keys.
+        """
+        start = len(self)
+        super().add(recording)
+        self.training = np.concatenate([self.training, np.arange(start, len(self))])
 
 
 def remembered_targets(

@@ -29,6 +29,7 @@ COMMANDS = {
     "share": "hvs_suite.cli.share:Share",
     "fetch": "hvs_suite.cli.fetch:Fetch",
     "pretrain": "hvs_suite.cli.pretrain:Pretrain",
+    "finetune": "hvs_suite.cli.finetune:Finetune",
     "train-sac": "hvs_suite.cli.train_sac:TrainSac",
     "ship": "hvs_suite.cli.ship:Ship",
     "evaluate": "hvs_suite.cli.evaluate:Evaluate",

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from hvs_suite.cli import console
 
 if TYPE_CHECKING:
-    from hvs_suite.policies.rl.evaluation import Evaluation
     from hvs_suite.policies.rl.run import Progress
 
 DEFAULT_MINUTES = 40.0
@@ -101,7 +100,7 @@ class TrainSac:
             f"{outcome.updates_per_env_step:.3f} a step; {outcome.n_parameters:,} parameters"
         )
         if outcome.evaluation is not None:
-            print(f"last evaluation: {_standing(outcome.evaluation)}")
+            print(f"last evaluation: {outcome.evaluation.in_words()}")
         print(f"wrote {self.out}")
 
 
@@ -115,12 +114,3 @@ def _words(state: "Progress") -> str:
     if state.evaluation is not None:
         parts.append(f"success {100 * state.evaluation.success_rate:.0f} %")
     return ", ".join(parts)
-
-
-def _standing(evaluation: "Evaluation") -> str:
-    """An evaluation in words."""
-    return (
-        f"return {evaluation.episode_return:.2f} in {evaluation.length:.1f} steps, success "
-        f"{100 * evaluation.success_rate:.0f} %, collisions {100 * evaluation.collision_rate:.0f} "
-        f"%, {evaluation.position_error_mm:.0f} mm and {evaluation.tilt_error_deg:.0f} deg off"
-    )

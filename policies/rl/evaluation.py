@@ -53,6 +53,14 @@ class Evaluation:
         names = [field.name for field in dataclasses.fields(self)][3:]
         return {name: float(getattr(self, name)) for name in names}
 
+    def in_words(self) -> str:
+        """The figures as one line."""
+        return (
+            f"return {self.episode_return:.2f} in {self.length:.1f} steps, success "
+            f"{100 * self.success_rate:.0f} %, collisions {100 * self.collision_rate:.0f} %, "
+            f"{self.position_error_mm:.3g} mm and {self.tilt_error_deg:.2g} deg off"
+        )
+
 
 class Examiner:
     """Plays the first scenes of `SPLIT`, always the same ones.

@@ -45,10 +45,15 @@ class Journal(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._parts = parts
         self._episode = 0
         self._actions: list[npt.NDArray[np.float32]] = []
+        self._standing: dict[str, Any] | None = None
 
     def place(self) -> dict[str, Any]:
-        """Where it is, as JSON has it: the episode's number, and the actions since its reset."""
-        return {"episode": self._episode, "actions": [a.tolist() for a in self._actions]}
+        """Where it is, as JSON has it: the episode's number, and the actions since its reset.
+
+        Of a `Curriculum` inside, also its standing at that reset.
+        """
+        place = {"episode": self._episode, "actions": [a.tolist() for a in self._actions]}
+        return place if self._standing is None else {**place, "curriculum": self._standing}
 
     def go_to(self, place: Mapping[str, Any]) -> None:
         """Let the next reset lead to where `place` said that it was.
@@ -58,6 +63,8 @@ class Journal(gymnasium.Wrapper[Any, Any, Any, Any]):
         """
         self._episode = int(place["episode"])
         self._actions = [np.array(action, np.float32) for action in place["actions"]]
+        if "curriculum" in place:
+            self.get_wrapper_attr("restore")(place["curriculum"])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -70,6 +77,8 @@ class Journal(gymnasium.Wrapper[Any, Any, Any, Any]):
         """
         scene = {"scenario": self._first + self._parts * self._episode}
         observation, info = self.env.reset(options=scene)
+        if self.has_wrapper_attr("standing"):
+            self._standing = self.get_wrapper_attr("standing")()
         for action in self._actions:
             observation, _, _, _, info = self.env.step(action)
         return observation, info

@@ -1,0 +1,127 @@
+"""``hvs finetune``: a pretrained policy, made better by reinforcement learning."""
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from hvs_suite.cli import console
+
+if TYPE_CHECKING:
+    from hvs_suite.policies.rl.run import Progress
+
+DEFAULT_MINUTES = 40.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Finetune:
+    """Fine-tune a pretrained policy by reinforcement learning.
+
+    Lets the policy play and trains its eyes on what it saw, then learns by TD3 what to add to its
+    actions. No expert is asked. Trains for --minutes or --steps, whichever ends first, or for forty
+    minutes if neither is given; ends early and keeps the last good state if success falls.
+    Interrupted, it goes on from its last checkpoint when the same command is given again. Curves
+    and a film of each evaluation are in OUT/training.
+
+    Attributes:
+        policy: Checkpoint of an hvs policy, as hvs pretrain makes it, or pretrained for the weights
+            shipped for the task.
+        task: A named task, such as align-thesis.
+        out: Folder for the checkpoint.
+        minutes: Stop after this much playing and learning, evaluations and eyes not counted (min).
+        steps: Stop after this many environment steps.
+        seed: Of weights, scenes, exploration and batches.
+        curriculum: Learn with wider tolerances first, or with starts nearer to the goal.
+        eye_rounds: How often, before, to let the policy play and train its eyes on what it saw.
+        eye_frames: Frames a round.
+        eye_steps: Optimiser steps a round.
+        warm_up_steps: Environment steps in which the critics learn alone.
+        bound: The most that is added to the policy's output, on its logarithmic scale.
+        noise: Standard deviation of the exploration, as a share of the bound.
+        actor_rate: Learning rate of what is added.
+        penalty: Weight of the squared share of the bound that is used.
+        updates: Updates after every 40 environment steps.
+        eval_every: Environment steps between evaluations; one more comes at start and end.
+        eval_episodes: Episodes an evaluation, on scenes of a split of their own.
+    """
+
+    policy: str
+    task: str
+    out: Path
+    minutes: float | None = None
+    steps: int | None = None
+    seed: int = 0
+    curriculum: Literal["tolerance", "start"] | None = None
+    eye_rounds: int = 2
+    eye_frames: int = 6_000
+    eye_steps: int = 1_000
+    warm_up_steps: int = 5_000
+    bound: float = 0.6
+    noise: float = 0.2
+    actor_rate: float = 1e-4
+    penalty: float = 0.1
+    updates: int = 20
+    eval_every: int = 10_000
+    eval_episodes: int = 100
+
+    def run(self) -> None:
+        """Train, showing how it goes, and say what came of it."""
+        from hvs_suite import registry
+        from hvs_suite.policies.catalogue import checkpoint_folder
+        from hvs_suite.policies.finetune.settings import Settings
+
+        settings = Settings(
+            eye_rounds=self.eye_rounds,
+            eye_frames=self.eye_frames,
+            eye_steps=self.eye_steps,
+            warm_up_steps=self.warm_up_steps,
+            bound=self.bound,
+            noise=self.noise,
+            actor_rate=self.actor_rate,
+            penalty=self.penalty,
+            updates=self.updates,
+        )
+        registry.find(self.task)
+        base = checkpoint_folder(self.policy, self.task)
+        from hvs_suite.policies.finetune.training import finetune
+
+        minutes = self.minutes
+        if minutes is None and self.steps is None:
+            minutes = DEFAULT_MINUTES
+        with console.meter() as update:
+            outcome = finetune(
+                base,
+                self.task,
+                self.out,
+                minutes=minutes,
+                steps=self.steps,
+                seed=self.seed,
+                settings=settings,
+                curriculum=self.curriculum,
+                eval_every=self.eval_every,
+                eval_episodes=self.eval_episodes,
+                on_progress=lambda state: update(state.stage, state.share, _words(state)),
+            )
+        print(
+            f"{outcome.env_steps} environment steps in {outcome.train_s:.0f} s, "
+            f"{outcome.env_steps_per_s:.0f} steps/s; {outcome.step} updates"
+        )
+        if outcome.has_fallen:
+            print("success fell, so the run was ended; what plays is from before")
+        if outcome.evaluation is not None:
+            print(f"last evaluation: {outcome.evaluation.in_words()}")
+        print(f"wrote {self.out}")
+
+
+def _words(state: "Progress") -> str:
+    """Steps, rate, time left and standing, in words."""
+    if not state.env_steps and state.evaluation is None:
+        return ""
+    parts = [f"step {state.env_steps}"]
+    if state.stage == "training":
+        parts += [f"{state.env_steps_per_s:.0f} steps/s", f"{state.seconds_left:.0f} s left"]
+    if not math.isnan(state.episode_return):
+        parts.append(f"return {state.episode_return:.2f}")
+    if state.evaluation is not None:
+        parts.append(f"success {100 * state.evaluation.success_rate:.0f} %")
+    return ", ".join(parts)

@@ -1,0 +1,156 @@
+"""What comes before RL where perception fails: eyes trained on what the policy itself gets to see.
+
+No expert is asked. The simulator knows where the target stands in each picture, and that is all
+that the eyes are trained on; head and residual stay as they are. A residual on features cannot know
+what the features have lost.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hvs_suite.datasets.features import dataset_features
+from hvs_suite.policies.dagger import play_round, read_round
+from hvs_suite.policies.demonstrations import (
+    GOAL_NORMAL,
+    GOAL_POSITION,
+    TARGET_PREFIX,
+    FramePool,
+    Manifest,
+)
+from hvs_suite.policies.finetune.folding import load_base, write_folded
+from hvs_suite.policies.finetune.settings import Settings
+from hvs_suite.policies.hvs.network import (
+    IMAGE_PREFIX,
+    MEMORY,
+    STATE,
+    Eye,
+    HvsNetwork,
+    sighting_loss,
+    target_loss,
+)
+from hvs_suite.policies.rl.journal import SCENES_A_SEED
+from hvs_suite.tasks.variants import AlignVariant
+
+BATCH_SIZE = 64
+# Scenes of a seed that its RL does not get to: it would play for months.
+FIRST_SCENE = SCENES_A_SEED // 2
+# Philox words that keep this stream apart from others of the same seed.
+ORDER_STREAM = 4
+
+
+def train_eyes(
+    base: Path,
+    folder: Path,
+    variant: AlignVariant,
+    options: Mapping[str, Any],
+    split: str,
+    seed: int,
+    settings: Settings,
+    on_share: Callable[[str, float], None],
+) -> Path:
+    """Let the policy play and train its eyes on what it saw, round by round.
+
+    A round that was finished is not done again; one that was interrupted is.
+
+    Args:
+        base: Checkpoint to begin with.
+        folder: Gets a folder a round: its frames, and the checkpoint that came of it.
+        variant: The named task.
+        options: Task options that differ from it.
+        split: Stream of scenes.
+        seed: Of the run.
+        settings: How many rounds, frames and steps.
+        on_share: Called with ``looking`` or ``training eyes``, and the share of it that is done.
+
+    Returns:
+        The checkpoint of the last round; the base if there are none.
+    """
+    manifest = Manifest(folder, variant.name, split, options, dataset_features(variant), 0, 0)
+    pool: FramePool | None = None
+    scene = seed * SCENES_A_SEED + FIRST_SCENE
+    checkpoint = base
+    for number in range(settings.eye_rounds):
+        place = folder / f"round-{number + 1}"
+        frames = place / "frames"
+        if read_round(frames) is None:
+            place.mkdir(parents=True, exist_ok=True)
+            seen = 0
+
+            def note(count: int) -> None:
+                nonlocal seen
+                seen += count
+                on_share("looking", seen / settings.eye_frames)
+
+            play_round(
+                manifest,
+                checkpoint,
+                frames,
+                frames=settings.eye_frames,
+                first_scenario=scene,
+                workers=settings.environments,
+                labelled=False,
+                on_frames=note,
+            )
+        found = read_round(frames)
+        assert found is not None
+        summary, recording = found
+        scene = summary.next_scenario
+        pool = pool or FramePool(manifest, seed)
+        pool.add(recording)
+        improved = place / "checkpoint"
+        if not (improved / "config.json").exists():
+            network = load_base(checkpoint)
+            _train(network, pool, settings, [seed, number], on_share)
+            write_folded(checkpoint, network, improved)
+        checkpoint = improved
+    return checkpoint
+
+
+def _train(
+    network: HvsNetwork,
+    pool: FramePool,
+    settings: Settings,
+    key: list[int],
+    on_share: Callable[[str, float], None],
+) -> None:
+    """Train the eyes alone, and nothing of them on actions."""
+    random = np.random.Generator(np.random.Philox(key=key, counter=ORDER_STREAM))
+    for eye in network.eyes.values():
+        assert isinstance(eye, Eye)
+        eye.train_in_bfloat16 = torch.cpu._is_avx512_bf16_supported()
+        eye.train()
+    optimizer = torch.optim.AdamW(network.eyes.parameters(), lr=settings.eye_rate)
+    for step in range(settings.eye_steps):
+        share = step / settings.eye_steps
+        for group in optimizer.param_groups:
+            group["lr"] = settings.eye_rate * 0.5 * (1.0 + math.cos(math.pi * share))
+        loss = eye_loss(network, pool.batch(random.integers(0, len(pool), BATCH_SIZE)))
+        optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(network.eyes.parameters(), 1.0)
+        optimizer.step()
+        on_share("training eyes", (step + 1) / settings.eye_steps)
+    network.eval()
+
+
+def eye_loss(network: HvsNetwork, batch: Mapping[str, Tensor]) -> Tensor:
+    """Loss of what the eyes see, and of where the target is taken to be.
+
+    Args:
+        network: Whose eyes.
+        batch: Inputs and ``privileged.*`` as `FramePool.batch` gives them.
+    """
+    images = {name: batch[IMAGE_PREFIX + name] for name in network.shape.cameras}
+    decision = network(images, batch[STATE], batch.get(MEMORY))
+    loss = torch.stack(
+        [sighting_loss(s, batch[TARGET_PREFIX + name]) for name, s in decision.sightings.items()]
+    ).sum()
+    truth = batch[GOAL_POSITION] - network.standoff * batch[GOAL_NORMAL]
+    assert decision.target is not None
+    return loss + 0.1 * target_loss(decision.target, truth, network.shape.error_scale)

@@ -1,0 +1,159 @@
+"""TD3 on a residual: Stable-Baselines3's, with critics that see more than the actor.
+
+What differs from its TD3: actor and critics read their own keys of the observation; the critics are
+an ensemble with layer norm of which two, drawn anew for each update, make the target (RLPD: Ball et
+al., 2023, https://arxiv.org/abs/2302.02948); the actor stands still while they warm up; and it is
+held to the base by a penalty against the normalised value, as in TD3+BC (Fujimoto and Gu, 2021,
+https://arxiv.org/abs/2106.06860).
+"""
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from gymnasium import spaces
+from stable_baselines3 import TD3
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.utils import polyak_update
+from stable_baselines3.td3.policies import Actor, MultiInputPolicy
+from torch import Tensor, nn
+
+from hvs_suite.policies.finetune.stage import FEATURES, PRIVILEGED
+from hvs_suite.policies.hvs.network import N_JOINTS, make_residual
+
+N_TARGET_CRITICS = 2
+
+
+class Keys(BaseFeaturesExtractor):
+    """Some keys of the observation, joined.
+
+    Args:
+        observation_space: Vectors by name.
+        keys: Which.
+    """
+
+    def __init__(self, observation_space: spaces.Dict, keys: tuple[str, ...]) -> None:
+        super().__init__(
+            observation_space, sum((observation_space[key].shape or (0,))[0] for key in keys)
+        )
+        self._keys = keys
+
+    def forward(self, observations: dict[str, Tensor]) -> Tensor:
+        """Join them.
+
+        Args:
+            observations: (B, n) by name.
+        """
+        return torch.cat([observations[key] for key in self._keys], dim=1)
+
+
+class ResidualPolicy(MultiInputPolicy):
+    """Actor on the features alone, critics on features, privileged state and action."""
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
+        """An actor that says nothing at first; SB3's interface."""
+        del features_extractor
+        keys = Keys(self._dict_space(), (FEATURES,))
+        actor = Actor(**{**self.actor_kwargs, **_extracted(keys)})
+        actor.mu = make_residual(keys.features_dim, actor.net_arch[0])
+        return actor.to(self.device)
+
+    def make_critic(
+        self, features_extractor: BaseFeaturesExtractor | None = None
+    ) -> ContinuousCritic:
+        """An ensemble of critics; SB3's interface."""
+        del features_extractor
+        keys = Keys(self._dict_space(), (FEATURES, PRIVILEGED))
+        critic = ContinuousCritic(**{**self.critic_kwargs, **_extracted(keys)})
+        n_inputs, [hidden, *_] = keys.features_dim + N_JOINTS, self.actor.net_arch
+        critic.q_networks = [_value(n_inputs, hidden) for _ in critic.q_networks]
+        for index, network in enumerate(critic.q_networks):
+            critic.add_module(f"qf{index}", network)
+        return critic.to(self.device)
+
+    def _dict_space(self) -> spaces.Dict:
+        assert isinstance(self.observation_space, spaces.Dict)
+        return self.observation_space
+
+
+class ResidualTD3(TD3):
+    """TD3 as this module's head says.
+
+    Attributes:
+        actor_rate: Learning rate of the actor; that of SB3 is the critics'.
+        warm_up_steps: Environment steps in which the critics learn alone.
+        penalty: Weight of the squared action against the normalised value.
+        bound: The most that an action of 1 adds to the base; noted here for who folds it in.
+    """
+
+    actor_rate: float
+    warm_up_steps: int
+    penalty: float
+    bound: float
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """Update critics, and actor once they have warmed up; SB3's interface."""
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.critic.optimizer)
+        for group in self.actor.optimizer.param_groups:
+            group["lr"] = self.actor_rate
+        assert self.replay_buffer is not None
+        frees_actor = self.num_timesteps >= self.warm_up_steps
+        critic_losses, actor_losses, sizes, values = [], [], [], []
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            data: Any = self.replay_buffer.sample(batch_size)
+            with torch.no_grad():
+                noise = torch.randn_like(data.actions) * self.target_policy_noise
+                noise = noise.clamp(-self.target_noise_clip, self.target_noise_clip)
+                after = (self.actor_target(data.next_observations) + noise).clamp(-1.0, 1.0)
+                ensemble = torch.cat(self.critic_target(data.next_observations, after), dim=1)
+                chosen = torch.randperm(ensemble.shape[1])[:N_TARGET_CRITICS]
+                worth = ensemble[:, chosen].amin(dim=1, keepdim=True)
+                target = data.rewards + (1.0 - data.dones) * self.gamma * worth
+            estimates = torch.cat(self.critic(data.observations, data.actions), dim=1)
+            loss = F.mse_loss(estimates, target.expand_as(estimates)) * estimates.shape[1]
+            self.critic.optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            self.critic.optimizer.step()
+            critic_losses.append(loss.item())
+            values.append(estimates.mean().item())
+            polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+            if frees_actor and self._n_updates % self.policy_delay == 0:
+                action = self.actor(data.observations)
+                worth = torch.cat(self.critic(data.observations, action), dim=1).mean(dim=1)
+                scale = 1.0 / worth.abs().mean().detach().clamp(min=1e-3)
+                size = (action**2).mean()
+                loss = self.penalty * size - scale * worth.mean()
+                self.actor.optimizer.zero_grad()
+                loss.backward()
+                self.actor.optimizer.step()
+                polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
+                actor_losses.append(loss.item())
+                sizes.append(size.item() ** 0.5)
+        self.logger.record("train/critic_loss", _mean(critic_losses))
+        self.logger.record("train/value", _mean(values))
+        if actor_losses:
+            self.logger.record("train/actor_loss", _mean(actor_losses))
+            self.logger.record("train/residual", _mean(sizes))
+
+
+def _value(n_inputs: int, hidden: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Linear(n_inputs, hidden),
+        nn.LayerNorm(hidden),
+        nn.ReLU(),
+        nn.Linear(hidden, hidden),
+        nn.LayerNorm(hidden),
+        nn.ReLU(),
+        nn.Linear(hidden, 1),
+    )
+
+
+def _extracted(keys: Keys) -> dict[str, Any]:
+    return {"features_extractor": keys, "features_dim": keys.features_dim}
+
+
+def _mean(values: list[float]) -> float:
+    return sum(values) / len(values)

@@ -1,0 +1,143 @@
+"""The environment of fine-tuning: the base policy plays, and the action is what to add to it.
+
+Images never leave the worker. What goes into the replay memory is what the base's eyes and geometry
+made of them, a hundred numbers, so that an update costs as much as RL on states. Critics also see
+what only the simulator knows; the actor, which has to do without in the end, does not.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+import torch
+from gymnasium import spaces
+
+from hvs_suite.cell.kinematics import kinematics
+from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
+from hvs_suite.policies.checkpoint import network_inputs
+from hvs_suite.policies.finetune.folding import load_base
+from hvs_suite.policies.hvs.network import N_JOINTS, Decision
+from hvs_suite.rollout import one_torch_thread
+
+FEATURES = "features"
+"""Key of what the actor reads: `Decision.features` of the base."""
+PRIVILEGED = "privileged"
+"""Key of what only the critics read, see `privileged_state`."""
+PRIVILEGED_SIZE = 26
+
+Observation = dict[str, npt.NDArray[np.float32]]
+
+
+def privileged_state(environment: Any, error_scale: float) -> npt.NDArray[np.float32]:
+    """What the critics see beyond the features.
+
+    Args:
+        environment: A `hvs_suite.load`ed environment.
+        error_scale: Of the network (m); errors are read as asinh(x / this).
+
+    Returns:
+        (26,): true joint positions and velocities in units of their limits, the way left to the
+        goal in the base frame, the rotation vector from flange axis to inward normal, what is left
+        of the time, steps held, and both cameras' targets.
+    """
+    truth, info, variant = environment.privileged(), environment.info, environment.variant
+    rotation, position = kinematics().flange_pose(truth["joint_positions"])
+    way = truth["goal_position"] - position
+    turn = np.cross(rotation[:, 2], -truth["goal_normal"])
+    left = 1.0 - environment.task.steps / variant.time_limit_steps
+    return np.concatenate(
+        [
+            truth["joint_positions"] / JOINT_RANGE_RAD,
+            environment.joint_velocities / JOINT_SPEED_RAD_S,
+            np.arcsinh(way / error_scale),
+            np.arcsinh(turn / error_scale),
+            [left, info["n_inside"] / variant.hold_steps],
+            truth["target_eih"][[2, 3]],
+            truth["target_eth"][[2, 3]],
+        ]
+    ).astype(np.float32)
+
+
+class ResidualStage(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Shows the base's features, and adds a residual to what the base says.
+
+    Observations are a ``Dict`` of ``features`` and ``privileged``, both vectors of float32. An
+    action is seven numbers in [-1, 1], shares of the bound: ``out = base + bound * action``, inside
+    the logarithmic scale that joint steps are learned in. The action zero plays the base policy.
+
+    The reward is the task's, and a potential beside it that changes no best policy (Ng, Harada and
+    Russell, 1999): gamma * phi(s') - phi(s), with phi(s) = -weight * asinh(error / tolerance), and
+    0 at the end of an episode.
+
+    Args:
+        env: An `hvs_suite.gym.AlignEnv`.
+        checkpoint: The base policy.
+        bound: The most that an action adds.
+        shaping: Weight of the potential.
+        gamma: Discount.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        checkpoint: Path,
+        bound: float,
+        shaping: float,
+        gamma: float,
+    ) -> None:
+        super().__init__(env)
+        with one_torch_thread():
+            self._network = load_base(checkpoint)
+        self._bound = bound
+        self._shaping = shaping
+        self._gamma = gamma
+        self._environment: Any = env.unwrapped.environment  # type: ignore[attr-defined]
+        self._tolerance_mm = self._environment.variant.tightest_tolerance_mm
+        self._memory: torch.Tensor | None = None
+        self._decision: Decision | None = None
+        self._state: torch.Tensor | None = None
+        self._potential = 0.0
+        sizes = {FEATURES: self._network.n_features, PRIVILEGED: PRIVILEGED_SIZE}
+        self.observation_space = spaces.Dict(
+            {k: spaces.Box(-np.inf, np.inf, (size,), np.float32) for k, size in sizes.items()}
+        )
+        self.action_space = spaces.Box(-1.0, 1.0, (N_JOINTS,), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode, options as the environment takes them."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._memory = None
+        self._potential = self._phi(info)
+        return self._look(observation), info
+
+    def step(
+        self, action: npt.NDArray[np.float32]
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Play one control step with the base's action and what is added to it."""
+        assert self._decision is not None
+        added = self._bound * torch.from_numpy(np.clip(action, -1.0, 1.0).astype(np.float32))
+        with torch.inference_mode():
+            command = self._network.to_action(self._decision.out + added, self._state)
+        observation, reward, terminated, truncated, info = self.env.step(command[0].numpy())
+        before, self._potential = self._potential, self._phi(info)
+        after = 0.0 if terminated or truncated else self._potential
+        reward = float(reward) + self._gamma * after - before
+        return self._look(observation), reward, terminated, truncated, info
+
+    def _phi(self, info: Mapping[str, Any]) -> float:
+        return -self._shaping * float(np.arcsinh(info["position_error_mm"] / self._tolerance_mm))
+
+    def _look(self, observation: Mapping[str, npt.NDArray[Any]]) -> Observation:
+        with one_torch_thread(), torch.inference_mode():
+            images, self._state = network_inputs(self._network, observation)
+            self._decision = self._network(images, self._state, self._memory)
+        self._memory = self._decision.memory
+        return {
+            FEATURES: self._decision.features[0].numpy().copy(),
+            PRIVILEGED: privileged_state(self._environment, self._network.shape.error_scale),
+        }

@@ -1,0 +1,248 @@
+"""RL fine-tuning of a pretrained `hvs` policy: eyes on its own frames, then TD3 on a residual.
+
+A run starts exactly at its base's success, and leaves one `hvs` checkpoint that needs nothing
+privileged. It is a function of base, task, settings, seed and number of steps. Killed, it goes on
+from its last checkpoint when the same command is given again.
+"""
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import math
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+import hvs_suite  # noqa: F401 - registers the tasks with Gymnasium
+from hvs_suite.errors import OptionError
+from hvs_suite.policies.allocator import keep_freed_memory
+from hvs_suite.policies.checkpoint import CheckpointPolicy, check_fit, read_config
+from hvs_suite.policies.finetune.eyes import train_eyes
+from hvs_suite.policies.finetune.folding import load_base, with_residual, write_folded
+from hvs_suite.policies.finetune.residual_td3 import ResidualPolicy, ResidualTD3
+from hvs_suite.policies.finetune.settings import Settings
+from hvs_suite.policies.finetune.stage import ResidualStage
+from hvs_suite.policies.hvs.network import N_JOINTS
+from hvs_suite.policies.rl.curriculum import Curriculum, Kind, levels_of
+from hvs_suite.policies.rl.evaluation import Examiner
+from hvs_suite.policies.rl.journal import OUTCOMES, Journal
+from hvs_suite.policies.rl.run import Budget, Outcome, Progress, Run
+from hvs_suite.policies.run_folder import claim, write_train_config
+from hvs_suite.registry import find
+from hvs_suite.rollout import library_seeds, worker_conditions
+from hvs_suite.tasks.scenario import TEST_SPLIT
+from hvs_suite.tasks.variants import AlignVariant, with_options
+
+PACKAGES = ("hvs-suite", "mujoco", "numpy", "stable-baselines3", "torch")
+
+
+def finetune(
+    policy: Path,
+    task: str,
+    out: Path,
+    *,
+    minutes: float | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    settings: Settings | None = None,
+    options: Mapping[str, Any] | None = None,
+    curriculum: Kind | None = None,
+    split: str = "train",
+    eval_every: int = 10_000,
+    eval_episodes: int = 100,
+    checkpoint_period_s: float = 120.0,
+    on_progress: Callable[[Progress], None] | None = None,
+) -> Outcome:
+    """Fine-tune a pretrained policy, or go on with a run that was interrupted.
+
+    Args:
+        policy: Checkpoint of an `hvs` policy.
+        task: Named task.
+        out: Folder for the checkpoint, an `hvs` policy like the base; the training state lives in
+            ``out/training``.
+        minutes: Stop after this much playing and learning, evaluations and eyes not counted (min).
+        steps: Stop after this many environment steps, rounded up to whole iterations. Give either,
+            or both for the first reached.
+        seed: Of weights, scenes, exploration and batches; below 2^32.
+        settings: Of the method.
+        options: Task options that differ from the named task's, for studies.
+        curriculum: Learn on easier tasks first, ``tolerance`` or ``start``, see `levels_of`;
+            evaluations are of the task itself.
+        split: Stream of scenes to learn from; anything but ``test``.
+        eval_every: Environment steps between evaluations; one more comes at start and end.
+        eval_episodes: Scenes an evaluation, of the split ``validation``.
+        checkpoint_period_s: Time between checkpoints (s).
+        on_progress: Called as the run goes on.
+
+    Returns:
+        What the run came to.
+
+    Raises:
+        UnknownTaskError: There is no such task.
+        PolicyError: The policy cannot be fine-tuned, or does not fit the task.
+        OptionError: No budget, or a value that makes no sense.
+        OutputError: ``out`` cannot be written, or holds something else than this run.
+    """
+    settings = settings or Settings()
+    options = dict(options or {})
+    variant = with_options(find(task), options)
+    limit = Budget(steps, minutes)
+    if not 0 <= seed < 2**32:
+        raise OptionError(f"seed must be from 0 to 2^32 - 1, not {seed}")
+    if split == TEST_SPLIT:
+        raise OptionError(f"split {TEST_SPLIT!r} is for scoring; train on another, such as train")
+    for name, count in (("eval_every", eval_every), ("eval_episodes", eval_episodes)):
+        if count < 1:
+            raise OptionError(f"{name} must be at least 1, not {count}")
+    levels = levels_of(task, curriculum) if curriculum is not None else [{}]
+    check_fit(read_config(policy), policy, variant)
+    load_base(policy)
+    keep_freed_memory()
+    torch.set_num_threads(min(2, torch.get_num_threads()))
+    identity = {
+        "base": hashlib.sha256((policy / "model.safetensors").read_bytes()).hexdigest(),
+        "task": task,
+        "task_version": variant.version,
+        "options": json.loads(json.dumps(options)),
+        "curriculum": curriculum,
+        "split": split,
+        "seed": seed,
+        **dataclasses.asdict(settings),
+    }
+    claim(out, identity)
+    budget = {"minutes": minutes, "steps": steps}
+    write_train_config(out, identity, budget, PACKAGES, policy=str(policy))
+    training = out / "training"
+
+    def on_eyes(stage: str, share: float) -> None:
+        if on_progress is not None:
+            on_progress(Progress(stage, share, 0, 0, 0.0, math.nan, math.nan, None))
+
+    # Torch and SB3 draw from the global generators of NumPy and torch.
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(library_seeds(seed))
+        base = train_eyes(
+            policy, training / "eyes", variant, options, split, seed, settings, on_eyes
+        )
+        make = MakeStage(task, options, levels, split, base, settings, seed)
+        with worker_conditions():
+            environments = SubprocVecEnv(
+                [dataclasses.replace(make, part=part) for part in range(settings.environments)],
+                start_method="spawn",
+            )
+        stack.callback(environments.close)
+        learner = _Finetuned(_make_model(environments, settings, seed), base, out, variant)
+        examiner = stack.enter_context(
+            contextlib.closing(Examiner(variant, options, eval_episodes))
+        )
+        run = Run(out, learner, examiner, on_progress)
+        stack.callback(run.close)
+        run.train(limit, settings.collect_steps, eval_every, checkpoint_period_s)
+        return run.outcome()
+
+
+@dataclasses.dataclass(frozen=True)
+class MakeStage:
+    """Makes one of a run's environments; travels to its worker.
+
+    Attributes:
+        task: Named task.
+        options: Task options that differ from it.
+        levels: Further options, of each level of the curriculum.
+        split: Stream of scenes.
+        base: Checkpoint that plays.
+        settings: Of the run.
+        seed: Of the run.
+        part: Which of the environments it is.
+    """
+
+    task: str
+    options: Mapping[str, Any]
+    levels: list[dict[str, Any]]
+    split: str
+    base: Path
+    settings: Settings
+    seed: int
+    part: int = 0
+
+    def __call__(self) -> gymnasium.Env[Any, Any]:
+        """Make it."""
+        settings = self.settings
+        env = Curriculum(self.task, self.levels, split=self.split, **self.options)
+        # The monitor inside: it sees the task's own rewards.
+        stage = ResidualStage(
+            Monitor(env, info_keywords=OUTCOMES),
+            self.base,
+            settings.bound,
+            settings.shaping,
+            settings.gamma,
+        )
+        return Journal(stage, self.seed, self.part, settings.environments)
+
+
+class _Finetuned:
+    """The run's model as `Run` takes it, and the checkpoint that comes of it."""
+
+    stops_when_fallen = True
+
+    def __init__(self, model: ResidualTD3, base: Path, out: Path, variant: AlignVariant) -> None:
+        self.model = model
+        self._base = base
+        self._out = out
+        self._candidate = out / "training" / "candidate"
+        self._variant = variant
+        [hidden, *_] = model.actor.net_arch
+        self._network = with_residual(load_base(base), hidden, model.bound)
+
+    def policy(self) -> CheckpointPolicy:
+        """Fold the residual into a checkpoint, and play that."""
+        residual = self._network.residual
+        assert residual is not None
+        residual.load_state_dict(self.model.actor.mu.state_dict())
+        write_folded(self._base, self._network, self._candidate)
+        return CheckpointPolicy(self._candidate, self._variant)
+
+    def keep(self) -> None:
+        """Put the candidate into the run's folder."""
+        for path in self._candidate.iterdir():
+            shutil.copy(path, self._out / f".{path.name}")
+            (self._out / f".{path.name}").replace(self._out / path.name)
+
+
+def _make_model(environments: SubprocVecEnv, settings: Settings, seed: int) -> ResidualTD3:
+    sigma = np.full(N_JOINTS, settings.noise)
+    model = ResidualTD3(
+        ResidualPolicy,
+        environments,
+        learning_rate=settings.critic_rate,
+        buffer_size=settings.replay_size,
+        # What would come before is drawn from the whole range of actions.
+        learning_starts=0,
+        batch_size=settings.batch_size,
+        tau=settings.tau,
+        gamma=settings.gamma,
+        train_freq=(settings.collect_steps // settings.environments, "step"),
+        gradient_steps=settings.updates,
+        action_noise=NormalActionNoise(np.zeros(N_JOINTS), sigma),
+        # A time limit is a failure, and critics see it coming: nothing is worth anything beyond.
+        replay_buffer_kwargs={"handle_timeout_termination": False},
+        target_policy_noise=settings.target_noise,
+        target_noise_clip=2.0 * settings.target_noise,
+        policy_kwargs={"net_arch": [settings.hidden], "n_critics": settings.critics},
+        seed=seed,
+        device="cpu",
+    )
+    model.actor_rate = settings.actor_rate
+    model.warm_up_steps = settings.warm_up_steps
+    model.penalty = settings.penalty
+    model.bound = settings.bound
+    return model
