@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 import hvs_suite  # noqa: F401 - registers the tasks with Gymnasium
 from hvs_suite.errors import OptionError
@@ -133,12 +133,7 @@ def finetune(
         base = train_eyes(
             policy, training / "eyes", variant, options, split, seed, settings, on_eyes
         )
-        make = MakeStage(task, options, levels, split, base, settings, seed)
-        with worker_conditions():
-            environments = SubprocVecEnv(
-                [dataclasses.replace(make, part=part) for part in range(settings.environments)],
-                start_method="spawn",
-            )
+        environments = _environments(MakeStage(task, options, levels, split, base, settings, seed))
         stack.callback(environments.close)
         learner = _Finetuned(_make_model(environments, settings, seed), base, out, variant)
         examiner = stack.enter_context(
@@ -189,6 +184,15 @@ class MakeStage:
         return Journal(stage, self.seed, self.part, settings.environments)
 
 
+def _environments(make: MakeStage) -> VecEnv:
+    """All environments of a run: a process each, or this one for a single one."""
+    parts = [dataclasses.replace(make, part=i) for i in range(make.settings.environments)]
+    if len(parts) == 1:
+        return DummyVecEnv([*parts])
+    with worker_conditions():
+        return SubprocVecEnv([*parts], start_method="spawn")
+
+
 class _Finetuned:
     """The run's model as `Run` takes it, and the checkpoint that comes of it."""
 
@@ -218,7 +222,7 @@ class _Finetuned:
             (self._out / f".{path.name}").replace(self._out / path.name)
 
 
-def _make_model(environments: SubprocVecEnv, settings: Settings, seed: int) -> ResidualTD3:
+def _make_model(environments: VecEnv, settings: Settings, seed: int) -> ResidualTD3:
     sigma = np.full(N_JOINTS, settings.noise)
     model = ResidualTD3(
         ResidualPolicy,
