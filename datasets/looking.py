@@ -4,6 +4,11 @@ The expert knows where the target is. A policy that learns from it does not, whe
 target from both cameras, and the mean of all ways to all places that it might be at leads nowhere.
 So as long as no camera has seen the target, the demonstrator moves the arm out of the eye-to-hand
 camera's line of sight, to the same posture whatever it knows.
+
+Where the eye-to-hand camera stands a little elsewhere than it should, it says only within some
+centimetres where the target is. Who goes there at once ends up beside it, too low for the eye in
+the hand to see it. So until the eye in the hand has seen the target, the demonstrator heads for a
+place above it, from which it will.
 """
 
 from __future__ import annotations
@@ -25,19 +30,27 @@ LOOK_OUT_RAD: FloatArray = np.array([1.75, 0.8, 0.0, -0.6, 0.0, 0.6, 0.0])
 """Where the arm goes to look (rad), chosen for the fewest steps (docs/experiments/look-out.md)."""
 
 
+LOOK_DOWN_M = 0.15
+"""How far above the goal the eye in the hand looks for the target (m): high enough to have it in
+view wherever the eye-to-hand camera may take it to be, and hardly a detour."""
+
+
 class Demonstrator(Expert):
     """Answers with the action that a policy should learn; one episode at a time."""
 
     def __init__(self, env: Environment) -> None:
         super().__init__(env)
-        self._has_seen = False
+        variant = env.variant
+        self._looks_down = variant.eth_position_noise_m > 0 or variant.eth_rotation_noise_deg > 0
+        self.reset()
 
     def reset(self) -> None:
         """Forget that the target was seen: a new episode begins."""
         self._has_seen = False
+        self._has_seen_closely = not self._looks_down
 
     def _truth(self) -> Mapping[str, FloatArray]:
-        if self._has_seen:
+        if self._has_seen and self._has_seen_closely:
             # Looking for the target in both pictures takes the most of ``privileged``.
             scenario = self._env.scenario
             return {
@@ -46,7 +59,12 @@ class Demonstrator(Expert):
                 "target_position": scenario.target,
             }
         truth = self._env.privileged()
-        self._has_seen = any(truth[name][3] > 0.5 for name in ("target_eih", "target_eth"))
+        in_hand, afar = (truth[name][3] > 0.5 for name in ("target_eih", "target_eth"))
+        self._has_seen = self._has_seen or bool(in_hand or afar)
+        self._has_seen_closely = self._has_seen_closely or bool(in_hand)
+        if not self._has_seen_closely:
+            raised = truth["goal_position"] + LOOK_DOWN_M * truth["goal_normal"]
+            return {**truth, "goal_position": raised}
         return truth
 
     def _next_set_point(

@@ -77,6 +77,33 @@ def train_and_judge(
         workers=workers,
         **options,
     )
+    return judge(name, policy, task, run, report, scenarios=scenarios, workers=workers)
+
+
+def judge(
+    name: str,
+    policy: Path,
+    task: str,
+    run: Path,
+    report: Report,
+    *,
+    scenarios: int,
+    workers: int,
+) -> Result:
+    """Play a policy, or go on where an earlier call was interrupted.
+
+    Args:
+        name: The policy in words, for the reports.
+        policy: Its checkpoint.
+        task: Named task to play.
+        run: Gets the result.
+        report: Called as the work goes on.
+        scenarios: How many to play.
+        workers: Processes that play.
+
+    Returns:
+        The result.
+    """
     n_played = 0
 
     def note(_trial: object) -> None:

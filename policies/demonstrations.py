@@ -6,7 +6,7 @@ package, which takes longer than opening a small dataset.
 
 import dataclasses
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,13 @@ from torch import Tensor
 from hvs_suite.datasets.metadata import read_metadata
 from hvs_suite.errors import DatasetError, OptionError
 from hvs_suite.policies.frame_cache import Frames, OnFrames, cached_frames, data_files
-from hvs_suite.policies.hvs.geometry import Calibration, calibrate, flange_motion
+from hvs_suite.policies.hvs.geometry import (
+    Calibration,
+    calibrate,
+    flange_motion,
+    seen_from_afar,
+    seen_from_hand,
+)
 from hvs_suite.policies.hvs.network import IMAGE_PREFIX, MEMORY, MEMORY_SIZE, N_JOINTS, STATE
 
 ACTION = "action"
@@ -33,11 +39,8 @@ HELD_OUT_SHARE = 0.05
 # Philox words that keep this stream apart from the training order.
 HELD_OUT_STREAM = 1
 MEMORY_STREAM = 3
-# How well a trained eye places the target, one sigma: the eye to hand; the eye in hand, as a share
-# of the distance and at the least.
-AFAR_SIGMA_M = 0.003
-HAND_SIGMA = 0.006
-HAND_SIGMA_M = 0.0002
+UV_SIGMA = {"eih": 0.006, "eth": 0.003}
+"""How well a trained eye finds the target in its image of [-1, 1], one sigma."""
 
 Column = npt.NDArray[Any]
 
@@ -167,14 +170,16 @@ class FramePool:
     Args:
         manifest: What they were recorded on.
         seed: Of the errors in what a policy would remember.
+        calibration: Of the network that learns; None if it has no joints, and remembers nothing.
 
     Attributes:
         manifest: As given.
     """
 
-    def __init__(self, manifest: Manifest, seed: int) -> None:
+    def __init__(self, manifest: Manifest, seed: int, calibration: Calibration | None) -> None:
         self.manifest = manifest
         self._seed = seed
+        self._calibration = calibration
         self._recordings: list[Recording] = []
         self._starts: npt.NDArray[np.int64] = np.zeros(0, np.int64)
         self._length = 0
@@ -195,12 +200,14 @@ class FramePool:
 
     def _with_memory(self, recording: Recording, number: int) -> Recording:
         """Add what a policy would remember at each frame, where the columns tell."""
-        needed = {STATE, GOAL_POSITION, GOAL_NORMAL}
-        if not needed <= set(recording.columns):
+        if self._calibration is None:
             return recording
         key = np.random.Philox(key=[self._seed, MEMORY_STREAM], counter=number)
         memory = remembered_targets(
-            recording.columns, _standoff(self.manifest), np.random.Generator(key)
+            recording.columns,
+            list(self.manifest.cameras),
+            self._calibration,
+            np.random.Generator(key),
         )
         return Recording({**recording.columns, MEMORY: memory}, recording.images)
 
@@ -211,7 +218,7 @@ class FramePool:
             indices: Of the frames, (B,).
 
         Returns:
-            Images (B, C, H, W) uint8, and float32 the recordings' columns and ``memory`` (B, 4).
+            Images (B, C, H, W) uint8, and float32 the recordings' columns and ``memory``.
         """
         # Neighbours on disk together: the same rows, fewer page faults.
         indices = np.sort(indices)
@@ -266,8 +273,11 @@ class Demonstrations(FramePool):
         episodes: int | None = None,
         on_frames: OnFrames | None = None,
     ) -> None:
-        super().__init__(manifest, seed)
         columns = _read_columns(manifest)
+        calibration = None
+        if {STATE, GOAL_POSITION, GOAL_NORMAL} <= set(columns):
+            calibration = _calibrate(manifest, columns)
+        super().__init__(manifest, seed, calibration)
         images: dict[str, Frames] = {}
         for name, shape in manifest.cameras.items():
             key = IMAGE_PREFIX + name
@@ -299,42 +309,57 @@ class Demonstrations(FramePool):
 
 
 def remembered_targets(
-    columns: Mapping[str, Column], standoff_m: float, random: np.random.Generator
+    columns: Mapping[str, Column],
+    cameras: Sequence[str],
+    calibration: Calibration,
+    random: np.random.Generator,
 ) -> npt.NDArray[np.float32]:
-    """What a policy remembers at each frame: the target where it last saw it, a little off.
+    """What a policy remembers at each frame: the target where each camera last saw it.
+
+    It is off by what the eye errs in the image, and by what calibration and joints err in space.
 
     Args:
-        columns: State, goal, targets in the images and ``episode_index``, (n, k) each.
-        standoff_m: Distance between flange face and target at the goal (m).
-        random: Draws how far off.
+        columns: State, targets in the images and ``episode_index``, (n, k) each.
+        cameras: Their names, in the order of the network's eyes.
+        calibration: Of the network.
+        random: Draws how far off in the image.
 
     Returns:
-        Place (m, base frame), and 1 if a camera saw the target earlier in the episode, else 0 and
-        the place 0, (n, 4).
+        For each camera the place (m, base frame), and 1 if it saw the target earlier in the
+        episode, else 0 and the place 0, (n, 4 per camera).
     """
-    target = columns[GOAL_POSITION] - standoff_m * columns[GOAL_NORMAL]
-    n = len(target)
-    q = torch.from_numpy(columns[STATE][:, :N_JOINTS])
-    distance = np.linalg.norm(target - flange_motion(q).position.numpy(), axis=1)
-    in_hand, afar = (_in_view(columns.get(TARGET_PREFIX + name), n) for name in ("eih", "eth"))
-    sigma = np.where(in_hand, HAND_SIGMA_M + HAND_SIGMA * distance, AFAR_SIGMA_M)
-    off = random.normal(size=(n, 3)) * sigma[:, None]
-    off[:, 2] = 0.0  # on the surface, which is known
+    n = len(columns[EPISODE])
+    motion = flange_motion(torch.from_numpy(columns[STATE][:, :N_JOINTS]))
+    height = torch.tensor(calibration.plane_height_m, dtype=torch.float32)
     episodes, frames = columns[EPISODE], np.arange(n)
     first = np.maximum.accumulate(np.where(np.diff(episodes, prepend=-1) != 0, frames, 0))
-    last_seen = np.maximum.accumulate(np.where(in_hand | afar, frames, -1))
-    before = np.concatenate([[-1], last_seen[:-1]])
-    memory = np.zeros((n, MEMORY_SIZE), np.float32)
-    known = before >= first
-    memory[known, :3] = (target + off)[before[known]]
-    memory[known, 3] = 1.0
+    memory = np.zeros((n, MEMORY_SIZE * len(cameras)), np.float32)
+    for i, camera in enumerate(cameras):
+        target = columns.get(TARGET_PREFIX + camera)
+        if target is None:
+            continue
+        off = UV_SIGMA[camera] * random.normal(size=(n, 2))
+        uv = torch.from_numpy((target[:, :2] + off).astype(np.float32))
+        if camera == "eih":
+            rays = torch.from_numpy(calibration.rays.astype(np.float32))
+            place = seen_from_hand(motion, uv, rays, height).numpy()
+        else:
+            homography = torch.from_numpy(calibration.homography.astype(np.float32))
+            place = seen_from_afar(uv, homography, height).numpy()
+        seen = _in_view(target)
+        if camera == "eih":
+            seen &= place[:, 3] > 0
+        last_seen = np.maximum.accumulate(np.where(seen, frames, -1))
+        before = np.concatenate([[-1], last_seen[:-1]])
+        known = before >= first
+        slot = memory[:, MEMORY_SIZE * i : MEMORY_SIZE * (i + 1)]
+        slot[known, :3] = place[before[known], :3]
+        slot[known, 3] = 1.0
     return memory
 
 
-def _in_view(target: Column | None, n: int) -> npt.NDArray[np.bool_]:
+def _in_view(target: Column) -> npt.NDArray[np.bool_]:
     """Which frames show the target, (n,)."""
-    if target is None:
-        return np.zeros(n, np.bool_)
     return np.asarray((target[:, 3] > 0.5) & (np.abs(target[:, :2]).max(axis=1) <= 1.0))
 
 
@@ -355,6 +380,10 @@ def calibration_of(root: Path) -> Calibration:
     missing = {STATE, GOAL_POSITION, GOAL_NORMAL} - set(columns)
     if missing:
         raise DatasetError(f"{root} lacks {', '.join(sorted(missing))}")
+    return _calibrate(manifest, columns)
+
+
+def _calibrate(manifest: Manifest, columns: Mapping[str, Column]) -> Calibration:
     double = {key: column.astype(np.float64) for key, column in columns.items()}
     return calibrate(
         q=double[STATE][:, :N_JOINTS],

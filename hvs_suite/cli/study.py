@@ -130,6 +130,64 @@ class Ablation:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class FewDemonstrations:
+    """Measure what RL adds where demonstrations are few, against two controls.
+
+    Bases learn from a few demonstrations by cloning alone. From each, RL fine-tuning and DAgger get
+    the same number of environment steps; RL from scratch gets them without a base. Interrupted, the
+    same command goes on.
+
+    Attributes:
+        data: Recorded dataset; its task is played.
+        out: Folder of the study: study.json, study.md, study.png, and a sub-folder a run.
+        demonstrations: How many to learn from; give it several times; 25, 50, 100 and 200 by
+            default.
+        env_steps: Environment steps of each way.
+        base_steps: Optimiser steps of each base.
+        imitation_steps: Optimiser steps of DAgger, its base's included.
+        imitation_rounds: Rounds that its environment steps are spread over.
+        eye_frames: Environment steps of fine-tuning that train the eyes, in two rounds.
+        seeds: Runs of everything.
+        episodes: Scenes of split dev that bases and ends are judged on.
+        workers: Processes that play.
+    """
+
+    data: Path
+    out: Path
+    demonstrations: tuple[int, ...] = ()
+    env_steps: int = 40_000
+    base_steps: int = 1500
+    imitation_steps: int = 4500
+    imitation_rounds: int = 5
+    eye_frames: int = 12_000
+    seeds: int = 3
+    episodes: int = 200
+    workers: int = 2
+
+    def run(self) -> None:
+        """Train and judge, showing how it goes; write and print what was found."""
+        from hvs_suite.eval import few_demonstrations
+        from hvs_suite.files import check_writable
+
+        check_writable(self.out / "study.json")
+        budget = few_demonstrations.Budget(
+            env_steps=self.env_steps,
+            base_steps=self.base_steps,
+            imitation_steps=self.imitation_steps,
+            imitation_rounds=self.imitation_rounds,
+            eye_frames=self.eye_frames,
+            seeds=self.seeds,
+            episodes=self.episodes,
+            workers=self.workers,
+        )
+        counts = self.demonstrations or (25, 50, 100, 200)
+        with console.meter() as update:
+            study = few_demonstrations.run_study(self.data, self.out, counts, budget, update)
+        text = few_demonstrations.markdown(study)
+        _write(self.out, study.model_dump_json(indent=2), text, few_demonstrations.draw(study))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Attention:
     """Draw where an hvs policy looks in both cameras, through one episode.
 
@@ -183,7 +241,7 @@ def _write(out: Path, content: str, text: str, figure: Any) -> None:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Study:
-    """Run an experiment about the suite itself: compression, ablation, attention.
+    """Run an experiment about the suite itself.
 
     Attributes:
         study: Which one.
@@ -192,6 +250,7 @@ class Study:
     study: Annotated[
         Annotated[Compression, tyro.conf.subcommand("compression")]
         | Annotated[Ablation, tyro.conf.subcommand("ablation")]
+        | Annotated[FewDemonstrations, tyro.conf.subcommand("few-demonstrations")]
         | Annotated[Attention, tyro.conf.subcommand("attention")],
         tyro.conf.OmitSubcommandPrefixes,
         tyro.conf.OmitArgPrefixes,

@@ -101,7 +101,7 @@ def train_eyes(
         assert found is not None
         summary, recording = found
         scene = summary.next_scenario
-        pool = pool or FramePool(manifest, seed)
+        pool = pool or FramePool(manifest, seed, load_base(base).calibration)
         pool.add(recording)
         improved = place / "checkpoint"
         if not (improved / "config.json").exists():

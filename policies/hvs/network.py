@@ -3,9 +3,9 @@
 Each camera has its own small convolutional encoder that ends in one *keypoint*: the softmax of one
 channel is a distribution over the image, its mean the target's centre. The keypoints are placed in
 space by fixed geometry, and a small perceptron turns joints and target into a joint step on a
-logarithmic scale, so that errors of a micrometre and of a metre both teach it something. Where the
-arm hides the target from both cameras, the place where it was last seen stands in: a memory of
-three numbers, which the caller keeps.
+logarithmic scale, so that errors of a micrometre and of a metre both teach it something. Where a
+camera does not see the target, the place where it last saw it stands in: a memory of three numbers
+for each camera, which the caller keeps.
 
 No LeRobot in here: a rollout worker starts in the time torch takes to import.
 """
@@ -28,6 +28,7 @@ STATE = "observation.state"
 MEMORY = "memory"
 """Key of a batch: where the target was last seen before, see `HvsNetwork.forward`."""
 MEMORY_SIZE = 4
+"""Numbers that are remembered of each camera."""
 N_JOINTS = 7
 FEATURE_SIZE = 28
 """Cells along the side of a feature map, about."""
@@ -43,6 +44,7 @@ that is large, and less than two thirds of the error scale in one that is small.
 POSITIONS_AND_VELOCITIES = 2 * N_JOINTS
 SEEN_LOGIT = 2.0
 """How sure an eye must be (as a logit) that it sees the target before its place is remembered."""
+NEVER_LOGIT = -20.0
 ESTIMATE_FEATURES = 7
 
 
@@ -131,7 +133,8 @@ class Decision:
         features: What a residual reads, (B, n): the head's inputs, and what the head alone says.
         sightings: Camera name to what it saw.
         target: Where the target is taken to be, (B, 3) m in the base frame; None without joints.
-        memory: What to remember for the next observation, (B, 4); None without joints.
+        memory: What to remember for the next observation, (B, 4 n) for n cameras; None without
+            joints.
         motion: Where the flange is, by the measured joints; None without them.
     """
 
@@ -296,8 +299,8 @@ class HvsNetwork(nn.Module):
         n_cameras = len(shape.cameras)
         width = SIGHTING_FEATURES * n_cameras
         if shape.state_dim:
-            # Each camera's estimate, the better of two, the remembered one.
-            n_estimates = n_cameras + (n_cameras > 1) + 1
+            # What each camera sees, what it saw, and what is made of all that.
+            n_estimates = 2 * n_cameras + 1
             width += 3 * N_JOINTS + 12 + ESTIMATE_FEATURES * n_estimates + N_JOINTS
             width += "eih" in shape.cameras
             if shape.state_dim == POSITIONS_AND_VELOCITIES:
@@ -316,6 +319,9 @@ class HvsNetwork(nn.Module):
             nn.SiLU(),
             last,
         )
+        # How far to trust what each camera saw before; cameras say of their own how far to trust
+        # what they see.
+        self.memory_trust = nn.Parameter(torch.zeros(n_cameras))
         self.step_gain = nn.Parameter(torch.full((N_JOINTS,), 0.5))
         self.n_features = width + N_JOINTS
         self.residual = (
@@ -329,6 +335,18 @@ class HvsNetwork(nn.Module):
         self.plane_height.fill_(calibration.plane_height_m)
         self.standoff.fill_(calibration.standoff_m)
         self.size_at_1m.fill_(calibration.size_at_1m)
+
+    @property
+    def calibration(self) -> Calibration:
+        """Camera maps and surface, as `set_calibration` took them."""
+        rays, homography = (m.double().numpy(force=True) for m in (self.rays, self.homography))
+        return Calibration(
+            rays,
+            homography,
+            self.plane_height.item(),
+            self.standoff.item(),
+            self.size_at_1m.item(),
+        )
 
     def look(self, images: Mapping[str, Tensor]) -> dict[str, Sighting]:
         """Run the eyes.
@@ -353,8 +371,8 @@ class HvsNetwork(nn.Module):
             images: Camera name to (B, C, H, W), uint8, or float in [0, 1].
             state: Measured joint positions (rad), then velocities (rad/s), (B, 14) or (B, 7);
                 None if the policy has no joint inputs.
-            memory: Where the target was last seen (m, base frame), and 1 if it was ever seen in
-                this episode, else 0, (B, 4); None for never.
+            memory: For each camera, in the order of the eyes, where it last saw the target (m, base
+                frame), and 1 if it ever did in this episode, else 0, (B, 4 n); None for never.
 
         Returns:
             The decision.
@@ -373,7 +391,7 @@ class HvsNetwork(nn.Module):
             return Decision(out, known, sightings, None, None, None)
         q = state[:, :N_JOINTS]
         if memory is None:
-            memory = state.new_zeros(len(state), MEMORY_SIZE)
+            memory = state.new_zeros(len(state), MEMORY_SIZE * len(sightings))
         motion = geometry.flange_motion(q)
         target, estimates, remembered = self._place(motion, sightings, memory)
         scale = self.shape.error_scale
@@ -410,39 +428,42 @@ class HvsNetwork(nn.Module):
     ) -> tuple[Tensor, list[Tensor], Tensor]:
         """Put the target into space.
 
+        A camera counts as far as it sees the target and is to be trusted; what it remembers, as far
+        as it does not see it. Where the eye to hand stands a little elsewhere than it should, it is
+        centimetres off, and what the eye in hand saw a second ago is better.
+
         Returns:
             The best estimate (B, 3) m, every estimate with its weight, (B, 4) each, and the next
-            memory (B, 4).
+            memory (B, 4 n).
         """
-        estimates, logits = [], []
-        valid = motion.position.new_ones(len(motion.position), 1)
-        for name, sighting in sightings.items():
-            logit = sighting.visible_logit
+        places, logits, slots, hidden, held = [], [], [], [], []
+        never = motion.position.new_full((len(motion.position), 1), NEVER_LOGIT)
+        for i, (name, sighting) in enumerate(sightings.items()):
+            visible = sighting.visible_logit
             if name == "eih":
                 point = geometry.seen_from_hand(motion, sighting.uv, self.rays, self.plane_height)
-                valid = point[:, 3:]
-                logit = torch.where(valid > 0, logit, torch.full_like(logit, -20.0))
+                visible = torch.where(point[:, 3:] > 0, visible, never)
             else:
                 point = geometry.seen_from_afar(sighting.uv, self.homography, self.plane_height)
-            estimates.append(torch.cat([point[:, :3], torch.sigmoid(logit)], dim=1))
-            logits.append(logit)
-        seen = torch.stack(logits).amax(dim=0)
-        best = estimates[0][:, :3]
-        if len(estimates) > 1:
-            hand, afar = sightings.values()  # the eye in hand comes first
-            logit = hand.trust_logit - afar.trust_logit
-            share = torch.sigmoid(torch.where(valid > 0, logit, torch.full_like(logit, -20.0)))
-            best = share * estimates[0][:, :3] + (1.0 - share) * estimates[1][:, :3]
-            estimates.append(torch.cat([best, share], dim=1))
-        known = memory[:, 3:]
-        # An empty memory stands at the present estimate, so that it says nothing.
-        place = known * memory[:, :3] + (1.0 - known) * best
-        estimates.append(torch.cat([place, known], dim=1))
-        is_seen = seen > SEEN_LOGIT
-        fresh = torch.cat([best, torch.ones_like(known)], dim=1)
-        remembered = torch.where(is_seen, fresh, memory).detach()
-        doubt = 1.0 - torch.sigmoid(seen)
-        return best + doubt * (place - best), estimates, remembered
+            slot = memory[:, MEMORY_SIZE * i : MEMORY_SIZE * (i + 1)]
+            places.append(point[:, :3])
+            slots.append(slot)
+            logits.append(sighting.trust_logit + F.logsigmoid(visible))
+            trust = self.memory_trust[i] + F.logsigmoid(-visible)
+            hidden.append(torch.where(slot[:, 3:] > 0, trust, 2.0 * never))
+            fresh = torch.cat([point[:, :3], torch.ones_like(visible)], dim=1)
+            held.append(torch.where(visible > SEEN_LOGIT, fresh, slot))
+        weights = torch.softmax(torch.cat([*logits, *hidden], dim=1), dim=1)
+        now = len(places)
+        stacked = torch.stack([*places, *(slot[:, :3] for slot in slots)], dim=1)
+        best = (weights[:, :, None] * stacked).sum(dim=1)
+        # An empty memory stands at the best estimate, so that it says nothing.
+        places += [torch.where(slot[:, 3:] > 0, slot[:, :3], best) for slot in slots]
+        estimates = [
+            torch.cat([place, weights[:, i : i + 1]], dim=1) for i, place in enumerate(places)
+        ]
+        estimates.append(torch.cat([best, weights[:, :now].sum(dim=1, keepdim=True)], dim=1))
+        return best, estimates, torch.cat(held, dim=1).detach()
 
     def to_action(self, out: Tensor, state: Tensor | None) -> Tensor:
         """Decode the head's output.

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import hvs_suite
+from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.datasets.expert import Expert
 from hvs_suite.datasets.looking import Demonstrator
 
@@ -54,3 +55,27 @@ def test_once_seen_the_target_is_gone_for_as_the_expert_goes():
             env.reset(scenario=next(scenarios))
         demonstrator = Demonstrator(env)
         np.testing.assert_array_equal(demonstrator.label(), Expert(env).label())
+
+
+@pytest.mark.parametrize("task", ["align-hard", "align-drill"])
+def test_where_the_far_camera_may_be_off_the_hand_looks_before_it_comes_down(task):
+    heights_m = []
+    with hvs_suite.load(task, split="train", observations="state") as env:
+        demonstrator = Demonstrator(env)
+        for scenario in range(30):
+            time_step = env.reset(scenario=scenario)
+            demonstrator.reset()
+            while not time_step.last():
+                truth = env.privileged()
+                _, flange = kinematics().flange_pose(truth["joint_positions"])
+                height_m = (flange - truth["goal_position"]) @ truth["goal_normal"]
+                if truth["target_eih"][3] > 0.5:
+                    heights_m.append(height_m)
+                    break
+                time_step = env.step(demonstrator.select_action({}))
+            while not time_step.last():
+                time_step = env.step(demonstrator.select_action({}))
+            assert env.info["is_success"], scenario
+    # Now and then the arm starts lower than that.
+    assert np.mean(np.array(heights_m) > 0.1) > 0.85
+    assert len(heights_m) == 30

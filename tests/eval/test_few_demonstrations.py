@@ -1,0 +1,53 @@
+"""From a few demonstrations: RL and its controls from the same bases, judged on the same scenes."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from hvs_suite.errors import OptionError
+from hvs_suite.eval import few_demonstrations
+from hvs_suite.eval.few_demonstrations import FINETUNED, IMITATED, SCRATCH, Budget, run_study
+
+SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "align-thesis"
+BUDGET = Budget(
+    env_steps=120, base_steps=2, imitation_steps=3, imitation_rounds=2, eye_frames=40, seeds=1,
+    episodes=2, workers=1,
+)  # fmt: skip
+pytestmark = pytest.mark.timeout(600)
+
+
+def test_every_way_has_the_same_steps_and_is_not_made_twice(tmp_path):
+    study = run_study(SAMPLE, tmp_path, [3], BUDGET, lambda *words: None)
+    ways = {curve.way: curve for curve in study.curves}
+    assert set(ways) == {FINETUNED, IMITATED, SCRATCH}
+    for curve in study.curves:
+        assert curve.points[-1].env_steps == BUDGET.env_steps
+        steps = [point.env_steps for point in curve.points]
+        assert steps == sorted(steps)
+    # Both begin with the same base; what trained the eyes counts as played.
+    assert ways[FINETUNED].points[0] == ways[IMITATED].points[0]
+    assert ways[FINETUNED].points[1].env_steps == BUDGET.eye_frames
+    assert [(row.way, row.other) for row in study.comparisons] == [
+        (FINETUNED, "base"), (IMITATED, "base"), (FINETUNED, IMITATED),
+    ]  # fmt: skip
+    again = []
+    assert run_study(SAMPLE, tmp_path, [3], BUDGET, lambda *w: again.append(w[0])) == study
+    assert not again
+    text = few_demonstrations.markdown(study)
+    assert "| 3 |" in text
+    figure = few_demonstrations.draw(study)
+    assert [axes.get_title(loc="left") for axes in figure.axes] == ["3 demonstrations"]
+    assert len(figure.axes[0].lines) == 3
+
+
+@pytest.mark.parametrize("change", [{"seeds": 0}, {"env_steps": 40}, {"workers": 0}])
+def test_a_budget_that_makes_no_sense_is_refused(change):
+    with pytest.raises(OptionError):
+        dataclasses.replace(BUDGET, **change)
+
+
+@pytest.mark.parametrize("count", [1, 6])
+def test_more_demonstrations_than_there_are_are_refused(count, tmp_path):
+    with pytest.raises(OptionError, match="dataset's 5"):
+        run_study(SAMPLE, tmp_path, [count], BUDGET, lambda *words: None)
