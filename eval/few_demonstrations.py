@@ -117,6 +117,7 @@ class Budget:
         imitation_steps: Optimiser steps of the run that imitates more, its base's included.
         imitation_rounds: Rounds that its environment steps are spread over.
         eye_frames: Environment steps of fine-tuning that train the eyes, in two rounds.
+        eye_steps: Optimiser steps of each of them.
         seeds: Runs of everything.
         episodes: Scenes of split ``dev`` that ends are judged on.
         workers: Processes that play.
@@ -127,6 +128,7 @@ class Budget:
     imitation_steps: int
     imitation_rounds: int
     eye_frames: int
+    eye_steps: int
     seeds: int
     episodes: int
     workers: int
@@ -236,6 +238,7 @@ class _Maker:
         settings = Settings(
             eye_rounds=2 if budget.eye_frames >= 2 else 0,
             eye_frames=max(1, budget.eye_frames // 2),
+            eye_steps=budget.eye_steps,
             environments=budget.workers,
         )
 

@@ -147,6 +147,7 @@ class FewDemonstrations:
         imitation_steps: Optimiser steps of DAgger, its base's included.
         imitation_rounds: Rounds that its environment steps are spread over.
         eye_frames: Environment steps of fine-tuning that train the eyes, in two rounds.
+        eye_steps: Optimiser steps of each of them.
         seeds: Runs of everything.
         episodes: Scenes of split dev that bases and ends are judged on.
         workers: Processes that play.
@@ -160,6 +161,7 @@ class FewDemonstrations:
     imitation_steps: int = 4500
     imitation_rounds: int = 5
     eye_frames: int = 12_000
+    eye_steps: int = 1_000
     seeds: int = 3
     episodes: int = 200
     workers: int = 2
@@ -176,6 +178,7 @@ class FewDemonstrations:
             imitation_steps=self.imitation_steps,
             imitation_rounds=self.imitation_rounds,
             eye_frames=self.eye_frames,
+            eye_steps=self.eye_steps,
             seeds=self.seeds,
             episodes=self.episodes,
             workers=self.workers,

@@ -11,8 +11,8 @@ from hvs_suite.eval.few_demonstrations import FINETUNED, IMITATED, SCRATCH, Budg
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "align-thesis"
 BUDGET = Budget(
-    env_steps=120, base_steps=2, imitation_steps=3, imitation_rounds=2, eye_frames=40, seeds=1,
-    episodes=2, workers=1,
+    env_steps=120, base_steps=2, imitation_steps=3, imitation_rounds=2, eye_frames=40, eye_steps=2,
+    seeds=1, episodes=2, workers=1,
 )  # fmt: skip
 pytestmark = pytest.mark.timeout(600)
 
