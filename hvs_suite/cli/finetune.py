@@ -1,14 +1,10 @@
 """``hvs finetune``: a pretrained policy, made better by reinforcement learning."""
 
 import dataclasses
-import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from hvs_suite.cli import console
-
-if TYPE_CHECKING:
-    from hvs_suite.policies.rl.run import Progress
 
 DEFAULT_MINUTES = 40.0
 
@@ -100,28 +96,7 @@ class Finetune:
                 curriculum=self.curriculum,
                 eval_every=self.eval_every,
                 eval_episodes=self.eval_episodes,
-                on_progress=lambda state: update(state.stage, state.share, _words(state)),
+                on_progress=lambda state: update(state.stage, state.share, state.in_words()),
             )
-        print(
-            f"{outcome.env_steps} environment steps in {outcome.train_s:.0f} s, "
-            f"{outcome.env_steps_per_s:.0f} steps/s; {outcome.step} updates"
-        )
-        if outcome.has_fallen:
-            print("success fell, so the run was ended; what plays is from before")
-        if outcome.evaluation is not None:
-            print(f"last evaluation: {outcome.evaluation.in_words()}")
+        print(outcome.in_words())
         print(f"wrote {self.out}")
-
-
-def _words(state: "Progress") -> str:
-    """Steps, rate, time left and standing, in words."""
-    if not state.env_steps and state.evaluation is None:
-        return ""
-    parts = [f"step {state.env_steps}"]
-    if state.stage == "training":
-        parts += [f"{state.env_steps_per_s:.0f} steps/s", f"{state.seconds_left:.0f} s left"]
-    if not math.isnan(state.episode_return):
-        parts.append(f"return {state.episode_return:.2f}")
-    if state.evaluation is not None:
-        parts.append(f"success {100 * state.evaluation.success_rate:.0f} %")
-    return ", ".join(parts)

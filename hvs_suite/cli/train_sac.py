@@ -1,14 +1,9 @@
 """``hvs train-sac``: the thesis's baseline, soft actor-critic from scratch."""
 
 import dataclasses
-import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from hvs_suite.cli import console
-
-if TYPE_CHECKING:
-    from hvs_suite.policies.rl.run import Progress
 
 DEFAULT_MINUTES = 40.0
 
@@ -92,25 +87,7 @@ class TrainSac:
                 eval_every=self.eval_every,
                 eval_episodes=self.eval_episodes,
                 device=self.device,
-                on_progress=lambda state: update(state.stage, state.share, _words(state)),
+                on_progress=lambda state: update(state.stage, state.share, state.in_words()),
             )
-        print(
-            f"{outcome.env_steps} environment steps in {outcome.train_s:.0f} s, "
-            f"{outcome.env_steps_per_s:.1f} steps/s; {outcome.step} updates, "
-            f"{outcome.updates_per_env_step:.3f} a step; {outcome.n_parameters:,} parameters"
-        )
-        if outcome.evaluation is not None:
-            print(f"last evaluation: {outcome.evaluation.in_words()}")
+        print(outcome.in_words())
         print(f"wrote {self.out}")
-
-
-def _words(state: "Progress") -> str:
-    """Steps, rate, time left and standing, in words."""
-    parts = [f"step {state.env_steps}", f"{state.updates} updates"]
-    if state.stage == "training":
-        parts += [f"{state.env_steps_per_s:.1f} steps/s", f"{state.seconds_left:.0f} s left"]
-    if not math.isnan(state.episode_return):
-        parts.append(f"return {state.episode_return:.2f}")
-    if state.evaluation is not None:
-        parts.append(f"success {100 * state.evaluation.success_rate:.0f} %")
-    return ", ".join(parts)

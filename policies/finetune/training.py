@@ -22,7 +22,6 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
-import hvs_suite  # noqa: F401 - registers the tasks with Gymnasium
 from hvs_suite.errors import OptionError
 from hvs_suite.policies.allocator import keep_freed_memory
 from hvs_suite.policies.checkpoint import CheckpointPolicy, check_fit, read_config

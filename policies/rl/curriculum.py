@@ -13,7 +13,6 @@ from typing import Any, Literal
 
 import gymnasium
 
-import hvs_suite  # noqa: F401 - registers the tasks with Gymnasium
 from hvs_suite.errors import OptionError
 from hvs_suite.registry import find
 

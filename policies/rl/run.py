@@ -78,6 +78,19 @@ class Progress:
     episode_return: float
     evaluation: Evaluation | None
 
+    def in_words(self) -> str:
+        """Steps, rate, time left and standing as one line; empty before anything was played."""
+        if not self.env_steps and self.evaluation is None:
+            return ""
+        parts = [f"step {self.env_steps}", f"{self.updates} updates"]
+        if self.stage == "training":
+            parts += [f"{self.env_steps_per_s:.1f} steps/s", f"{self.seconds_left:.0f} s left"]
+        if not math.isnan(self.episode_return):
+            parts.append(f"return {self.episode_return:.2f}")
+        if self.evaluation is not None:
+            parts.append(f"success {100 * self.evaluation.success_rate:.0f} %")
+        return ", ".join(parts)
+
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
@@ -104,6 +117,19 @@ class Outcome:
     n_parameters: int
     evaluation: Evaluation | None
     has_fallen: bool
+
+    def in_words(self) -> str:
+        """What was done, and how it ended, a line each."""
+        lines = [
+            f"{self.env_steps} environment steps in {self.train_s:.0f} s, "
+            f"{self.env_steps_per_s:.1f} steps/s; {self.step} updates, "
+            f"{self.updates_per_env_step:.3f} a step; {self.n_parameters:,} parameters"
+        ]
+        if self.has_fallen:
+            lines.append("success fell, so the run was ended; what plays is from before")
+        if self.evaluation is not None:
+            lines.append(f"last evaluation: {self.evaluation.in_words()}")
+        return "\n".join(lines)
 
 
 @dataclasses.dataclass(frozen=True)

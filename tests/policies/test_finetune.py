@@ -7,7 +7,7 @@ import miniature
 import numpy as np
 import pytest
 import torch
-from safetensors import safe_open
+from rl_state import state_of
 from safetensors.torch import load_file
 
 import hvs_suite
@@ -71,17 +71,6 @@ def stage(base):
     with_base = ResidualStage(env, base, bound=0.6, shaping=0.1, gamma=0.9)
     yield with_base
     with_base.close()
-
-
-def state_of(folder):
-    """Tensors and header of a run's state, without what a clock decides."""
-    path = folder / "training" / "state.safetensors"
-    with safe_open(path, framework="pt") as file:
-        header = json.loads(file.metadata()["state"])
-    header.pop("elapsed_s")
-    for episode in header["recent"]:
-        episode.pop("t")
-    return load_file(path), header
 
 
 def played(folder, options=OPTIONS):

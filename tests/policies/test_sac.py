@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from safetensors import safe_open
+from rl_state import state_of
 from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -44,17 +44,6 @@ def kill_at(env_steps):
             raise Killed
 
     return on_progress
-
-
-def state_of(folder):
-    """Tensors and header of a run's state, without what a clock decides."""
-    path = folder / "training" / "state.safetensors"
-    with safe_open(path, framework="pt") as file:
-        header = json.loads(file.metadata()["state"])
-    header.pop("elapsed_s")
-    for episode in header["recent"]:
-        episode.pop("t")
-    return load_file(path), header
 
 
 def replay_of(folder, capacity=SMALL.replay_size):
