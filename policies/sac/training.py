@@ -16,6 +16,7 @@ from gymnasium import spaces
 from stable_baselines3 import SAC
 
 from hvs_suite.errors import OptionError
+from hvs_suite.policies.allocator import keep_freed_memory
 from hvs_suite.policies.rl.evaluation import Examiner
 from hvs_suite.policies.rl.journal import Journal, make_journal
 from hvs_suite.policies.rl.run import Budget, Outcome, Progress, Run
@@ -88,6 +89,7 @@ def train_sac(
     variant = with_options(find(task), options)
     limit = Budget(steps, minutes)
     _check(variant, seed, split, eval_every, eval_episodes, device)
+    keep_freed_memory()
     torch.set_num_threads(min(2, torch.get_num_threads()))
     identity = {
         "task": task,
