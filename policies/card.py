@@ -29,7 +29,7 @@ def write_card(folder: Path, results: Iterable[Mapping[str, Any]] = (), command:
     """Write a checkpoint's card.
 
     Args:
-        folder: The checkpoint, as `pretrain` leaves it.
+        folder: The checkpoint, as `pretrain` or `finetune` leaves it.
         results: Result files of `hvs evaluate`, parsed, that speak of these weights.
         command: That made the checkpoint; empty if it is not known.
 
@@ -37,7 +37,7 @@ def write_card(folder: Path, results: Iterable[Mapping[str, Any]] = (), command:
         The card's text without its front matter.
 
     Raises:
-        PolicyError: The folder holds no checkpoint of `pretrain`.
+        PolicyError: The folder holds no checkpoint of either.
         OutputError: It cannot be written.
     """
     config, trained, outcome = (
@@ -63,7 +63,7 @@ def ship(checkpoint: Path, folder: Path) -> None:
     """
     for name in (*CHECKPOINT_FILES, *TRAINING_FILES):
         if not (checkpoint / name).is_file():
-            raise PolicyError(f"{checkpoint} lacks {name}; let hvs pretrain come to its end first")
+            raise PolicyError(f"{checkpoint} lacks {name}; let its training come to its end first")
     for name in (*CHECKPOINT_FILES, *TRAINING_FILES):
         with replacing(folder / name) as temporary:
             shutil.copyfile(checkpoint / name, temporary)
@@ -86,29 +86,16 @@ def describe(
         command: As in `write_card`.
     """
     settings = trained["settings"]
+    was_fine_tuned = "bound" in settings
     inputs = ", ".join(
         f"`{key}` {' x '.join(map(str, value['shape']))}"
         for key, value in sorted(config["input_features"].items())
     )
-    rounds = outcome["rounds"]
-    corrected = sum(played["frames"] for played in rounds)
-    hours = (outcome["train_s"] + outcome["play_s"]) / 3600.0
     rows = {
         "trained on": f"`{settings['task']}`, split `train` alone",
         "inputs": inputs,
         "output": "`action` 7: joint position targets in units of the joint range",
-        "parameters": f"{outcome['n_parameters']:,}",
-        "demonstrations": "of the suite's expert",
-        "DAgger": f"{len(rounds)} rounds, {corrected:,} frames played by the policy itself under "
-        "the expert's labels"
-        if rounds
-        else "none",
-        "optimiser steps": f"{outcome['step']:,} of {settings['batch_size']} frames",
-        "time": f"{hours:.2f} h on two cores, recording not counted",
-        "supervision in training": "the expert's action, and where the target is "
-        "(`privileged.*`); neither is an input"
-        if settings["keypoint_weight"] > 0
-        else "the expert's action",
+        **(_rl_rows if was_fine_tuned else _imitation_rows)(settings, outcome),
         "seed": str(settings["seed"]),
         "licence": LICENCE,
     }
@@ -135,6 +122,43 @@ def describe(
         "",
     ]
     return "\n".join(lines)
+
+
+def _imitation_rows(settings: Mapping[str, Any], outcome: Mapping[str, Any]) -> dict[str, str]:
+    """What `pretrain` did."""
+    rounds = outcome["rounds"]
+    corrected = sum(played["frames"] for played in rounds)
+    hours = (outcome["train_s"] + outcome["play_s"]) / 3600.0
+    return {
+        "parameters": f"{outcome['n_parameters']:,}",
+        "demonstrations": "of the suite's expert",
+        "DAgger": f"{len(rounds)} rounds, {corrected:,} frames played by the policy itself under "
+        "the expert's labels"
+        if rounds
+        else "none",
+        "optimiser steps": f"{outcome['step']:,} of {settings['batch_size']} frames",
+        "time": f"{hours:.2f} h on two cores, recording not counted",
+        "supervision in training": "the expert's action, and where the target is "
+        "(`privileged.*`); neither is an input"
+        if settings["keypoint_weight"] > 0
+        else "the expert's action",
+    }
+
+
+def _rl_rows(settings: Mapping[str, Any], outcome: Mapping[str, Any]) -> dict[str, str]:
+    """What `finetune` did."""
+    looked = settings["eye_rounds"] * settings["eye_frames"]
+    return {
+        "fine-tuned from": f"a pretrained policy, weights `{settings['base'][:12]}`",
+        "eyes": f"{looked:,} frames of the policy's own episodes" if looked else "as they were",
+        "reinforcement learning": f"TD3 on a residual of {outcome['n_parameters']:,} parameters, "
+        f"{outcome['env_steps']:,} environment steps, {outcome['step']:,} updates of "
+        f"{settings['batch_size']} transitions",
+        "time": f"{outcome['train_s'] / 3600.0:.2f} h on two cores, eyes and evaluations not "
+        "counted",
+        "supervision in training": "the task's sparse reward, critics that see the simulator's "
+        "state, and for the eyes where the target is; no expert, and none of it is an input",
+    }
 
 
 def _results(results: list[Mapping[str, Any]]) -> list[str]:
@@ -170,5 +194,5 @@ def _read(path: Path) -> dict[str, Any]:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError) as error:
         raise PolicyError(
-            f"{path.parent} holds no finished run of hvs pretrain: no readable {path.name}"
+            f"{path.parent} holds no finished training run: no readable {path.name}"
         ) from error

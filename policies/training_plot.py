@@ -39,7 +39,7 @@ def draw_run(out: Path) -> Path:
     """
     from matplotlib.figure import Figure
 
-    curves = _curves(out / "training" / "tensorboard")
+    curves = read_curves(out / "training" / "tensorboard")
     rounds = _rounds(out / "training" / "dagger")
     figure = Figure(figsize=(11.0, 3.6), layout="constrained")
     whole, parts, played = figure.subplots(1, 3)
@@ -59,8 +59,15 @@ def draw_run(out: Path) -> Path:
     return target
 
 
-def _curves(folder: Path) -> dict[str, Curve]:
-    """Every scalar that TensorBoard holds: name to steps (n,) and values (n,)."""
+def read_curves(folder: Path) -> dict[str, Curve]:
+    """Every scalar that TensorBoard holds.
+
+    Args:
+        folder: Of its files.
+
+    Returns:
+        Name to steps (n,) and values (n,).
+    """
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     # A resumed run has a file a sitting, which is no cause for alarm.

@@ -26,6 +26,7 @@ from hvs_suite.policies.rl.evaluation import (
     write_evaluations,
 )
 from hvs_suite.policies.rl.journal import OUTCOMES
+from hvs_suite.policies.rl.plot import draw_rl_run
 from hvs_suite.policies.rl.state import Counters, Model, load_run, save_run
 from hvs_suite.rollout import Policy
 
@@ -232,6 +233,7 @@ class Run:
                 last_checkpoint = time.perf_counter()
             used = (share - begun) / max(1e-9, counters.elapsed_s - self._begun[1])
             self._report("training", share, max(0.0, 1.0 - share) / max(1e-12, used))
+        draw_rl_run(self._training, self._evaluations)
 
     def outcome(self) -> Outcome:
         """What the run has come to."""

@@ -180,7 +180,7 @@ def test_a_run_begins_with_what_its_base_is_worth_and_counts_what_it_did(whole):
     clips = sorted(path.name for path in (out / "training" / "clips").iterdir())
     assert clips == ["0000000000.mp4", f"{STEPS:010d}.mp4"]
     kinds = {p.suffix for p in out.rglob("*") if p.is_file() and "tfevents" not in p.name}
-    assert kinds == {".json", ".safetensors", ".npz", ".npy", ".mp4"}
+    assert kinds == {".json", ".safetensors", ".npz", ".npy", ".mp4", ".png"}
 
 
 def test_a_killed_run_ends_like_one_that_was_left_alone(whole, base, tmp_path):
@@ -229,6 +229,16 @@ def test_lerobot_plays_what_comes_of_it(whole):
     joints = np.concatenate([seen["joint_positions"], seen["joint_velocities"]])
     batch["observation.state"] = torch.from_numpy(joints.astype(np.float32))[None]
     np.testing.assert_allclose(policy.select_action(batch)[0].numpy(), played(out)[0], atol=1e-5)
+
+
+def test_a_fine_tuned_policy_is_shipped_like_any_other(whole, tmp_path):
+    out, outcome, _ = whole
+    shipped = tmp_path / "shipped"
+    assert run(["ship", str(out), "--to-folder", str(shipped)]) == 0
+    text = (shipped / "README.md").read_text()
+    assert f"{outcome.env_steps} environment steps" in text
+    assert "no expert" in text
+    assert (shipped / "training" / "training.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(

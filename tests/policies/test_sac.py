@@ -187,7 +187,7 @@ def test_nothing_in_the_folder_is_a_pickle(whole):
     out, _, _ = whole
     files = [path for path in out.rglob("*") if path.is_file()]
     kinds = {path.suffix for path in files if "tfevents" not in path.name}
-    assert kinds == {".json", ".safetensors", ".npz", ".mp4"}
+    assert kinds == {".json", ".safetensors", ".npz", ".mp4", ".png"}
     for path in (path for path in files if path.suffix == ".npz"):
         assert all(name.endswith(".npy") for name in zipfile.ZipFile(path).namelist())
         with np.load(path, allow_pickle=False) as content:
