@@ -139,7 +139,12 @@ class Expert:
     """Answers with the best action for the environment's present state.
 
     Follows :class:`hvs_suite.rollout.Policy`; the observation is not looked at.
+
+    Attributes:
+        n_swivel: Elbow places that it chooses from, around the line from shoulder to wrist.
     """
+
+    n_swivel = N_SWIVEL
 
     def __init__(self, env: Environment) -> None:
         """Attaches the expert to an environment.
@@ -205,7 +210,7 @@ class Expert:
             self._goal_key = key
             self._across = np.linalg.svd(normal[None])[2][1:]
             family = self._kinematics.goal_configurations_at_tool_angle(
-                position, normal, tool_angle=0.0, n_swivel=N_SWIVEL
+                position, normal, tool_angle=0.0, n_swivel=self.n_swivel
             )
             self._family = np.empty((7, len(family) + 1))
             self._family[:, :-1] = family.T

@@ -9,6 +9,11 @@ Where the eye-to-hand camera stands a little elsewhere than it should, it says o
 centimetres where the target is. Who goes there at once ends up beside it, too low for the eye in
 the hand to see it. So until the eye in the hand has seen the target, the demonstrator heads for a
 place above it, from which it will.
+
+And it goes there in one of two postures, the elbow straight above the line from shoulder to
+wrist, A1 towards the target or away from it. The expert chooses the soonest of some two thousand,
+and which that is jumps with every little change of where the arm stands: from random starts nobody
+could learn it (docs/experiments/simple-ways.md). Two postures cost a step or three.
 """
 
 from __future__ import annotations
@@ -37,6 +42,8 @@ view wherever the eye-to-hand camera may take it to be, and hardly a detour."""
 
 class Demonstrator(Expert):
     """Answers with the action that a policy should learn; one episode at a time."""
+
+    n_swivel = 1
 
     def __init__(self, env: Environment) -> None:
         super().__init__(env)

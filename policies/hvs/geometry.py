@@ -12,7 +12,15 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from hvs_suite.cell.robot import FLANGE_HEIGHT_M, JOINT_AXES, JOINT_HEIGHTS_M
+from hvs_suite.cell.robot import (
+    BASE_TO_SHOULDER_M,
+    ELBOW_TO_WRIST_M,
+    FLANGE_HEIGHT_M,
+    JOINT_AXES,
+    JOINT_HEIGHTS_M,
+    SHOULDER_TO_ELBOW_M,
+    WRIST_TO_FLANGE_M,
+)
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -120,6 +128,36 @@ def joint_step(motion: FlangeMotion, offset: Tensor) -> Tensor:
     near = offset * (LINEARISATION_RANGE_M / length.clamp(min=LINEARISATION_RANGE_M))
     error = torch.cat([near, tilt_in_flange], dim=1)
     return (inverse @ error[:, :, None])[:, :, 0]
+
+
+def postures(goal: Tensor) -> Tensor:
+    """The two plain postures that hold the flange at a goal, facing straight down.
+
+    Shoulder, elbow and wrist stand in one upright plane, the elbow above: a planar arm of two
+    links, by the law of cosines. A1 turns that plane towards the goal, or away from it with all
+    angles of the plane the other way round. Out of reach, the arm is stretched that way.
+
+    Args:
+        goal: Of the flange, (B, 3) m. No gradient flows through it.
+
+    Returns:
+        Angles of A1 to A6, (B, 2, 6) rad, A1 in [-pi, pi]; joint ranges are not looked at.
+    """
+    with torch.no_grad():
+        upper, fore = SHOULDER_TO_ELBOW_M, ELBOW_TO_WRIST_M
+        out = goal[:, :2].norm(dim=1)
+        up = goal[:, 2] + WRIST_TO_FLANGE_M - BASE_TO_SHOULDER_M
+        reach2 = (out**2 + up**2).clamp(max=(upper + fore) ** 2)
+        bend = torch.arccos(((reach2 - upper**2 - fore**2) / (2.0 * upper * fore)).clamp(-1.0, 1.0))
+        lean = torch.atan2(fore * torch.sin(bend), upper + fore * torch.cos(bend))
+        shoulder = torch.atan2(out, up) - lean
+        towards = torch.atan2(goal[:, 1], goal[:, 0])
+        zero = torch.zeros_like(out)
+        plane = torch.stack([shoulder, zero, -bend, zero, torch.pi - shoulder - bend], dim=1)
+        away = towards - torch.pi * torch.sign(towards)
+        one = torch.cat([towards[:, None], plane], dim=1)
+        other = torch.cat([away[:, None], -plane], dim=1)
+        return torch.stack([one, other], dim=1)
 
 
 def seen_from_hand(

@@ -46,6 +46,8 @@ SEEN_LOGIT = 2.0
 """How sure an eye must be (as a logit) that it sees the target before its place is remembered."""
 NEVER_LOGIT = -20.0
 ESTIMATE_FEATURES = 7
+N_POSTURES = 2
+POSTURE_FEATURES = 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -302,6 +304,7 @@ class HvsNetwork(nn.Module):
             # What each camera sees, what it saw, and what is made of all that.
             n_estimates = 2 * n_cameras + 1
             width += 3 * N_JOINTS + 12 + ESTIMATE_FEATURES * n_estimates + N_JOINTS
+            width += N_POSTURES * POSTURE_FEATURES
             width += "eih" in shape.cameras
             if shape.state_dim == POSITIONS_AND_VELOCITIES:
                 width += N_JOINTS
@@ -400,6 +403,7 @@ class HvsNetwork(nn.Module):
         step = torch.asinh(geometry.joint_step(motion, target + lift - motion.position) / scale)
         features += [torch.sin(q), torch.cos(q), q / self.joint_range]
         features += [motion.position, motion.rotation.flatten(1), step]
+        features += self._ways(q, geometry.postures(target + lift))
         if "eih" in sightings:
             # Where the joints lie about the height, the disc's size tells the truth.
             diameter = torch.exp(sightings["eih"].log_diameter.clamp(-5.0, 2.0))
@@ -413,6 +417,21 @@ class HvsNetwork(nn.Module):
             features += [offset, torch.asinh(in_flange / scale), estimate[:, 3:]]
         out, known = self._say(features, self.step_gain * step)
         return Decision(out, known, sightings, target, remembered, motion)
+
+    def _ways(self, q: Tensor, goals: Tensor) -> list[Tensor]:
+        """What the head reads of the ways to the plain postures, (B, 8) each.
+
+        The turns of A1 to A6 that are left, on the logarithmic scale, the time of the slowest at
+        full speed (s), and whether A1 can turn so far at all.
+        """
+        found = []
+        for goal in goals.unbind(dim=1):
+            way = goal - q[:, :-1]
+            time = (way.abs() / self.joint_speed[:-1]).amax(dim=1, keepdim=True)
+            reachable = (goal.abs() <= self.joint_range[:-1]).all(dim=1, keepdim=True)
+            scaled = torch.asinh(way / self.shape.error_scale)
+            found += [torch.cat([scaled, time, reachable.to(q.dtype)], dim=1)]
+        return found
 
     def _say(self, features: list[Tensor], step: Tensor | float) -> tuple[Tensor, Tensor]:
         """The output, and the features that a residual reads."""

@@ -50,6 +50,26 @@ def test_kinematics_agree_with_pinocchio():
         )
 
 
+def test_plain_postures_hold_the_flange_over_the_goal_facing_down():
+    generator = np.random.default_rng(0)
+    angle, radius = generator.uniform(-np.pi, np.pi, 50), generator.uniform(0.4, 0.78, 50)
+    goal = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(50, 0.05)], axis=1)
+    both = geometry.postures(torch.from_numpy(goal))
+    assert both.shape == (50, 2, 6)
+    for i, pair in enumerate(both.numpy()):
+        # The expert's own, with the elbow straight above: the demonstrator's two.
+        family = kinematics().goal_configurations_at_tool_angle(
+            goal[i], np.array([0.0, 0.0, 1.0]), tool_angle=0.0, n_swivel=1
+        )
+        for posture in pair:
+            q = np.append(posture, 0.0)
+            rotation, position = kinematics().flange_pose(q)
+            np.testing.assert_allclose(position, goal[i], atol=1e-9)
+            np.testing.assert_allclose(rotation[:, 2], [0.0, 0.0, -1.0], atol=1e-9)
+            within = (np.abs(q) <= JOINT_RANGE_RAD).all()
+            assert within == any(np.abs(q - each).max() < 1e-6 for each in family)
+
+
 def test_joint_step_brings_the_flange_to_a_near_goal_facing_down():
     poses = kinematics().goal_configurations(np.array([0.5, 0.2, 0.05]), np.array([0.0, 0.0, 1.0]))
     q = torch.from_numpy(poses[:3] + 0.01)
