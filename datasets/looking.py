@@ -10,10 +10,10 @@ centimetres where the target is. Who goes there at once ends up beside it, too l
 the hand to see it. So until the eye in the hand has seen the target, the demonstrator heads for a
 place above it, from which it will.
 
-And it goes there in one of two postures, the elbow straight above the line from shoulder to
-wrist, A1 towards the target or away from it. The expert chooses the soonest of some two thousand,
-and which that is jumps with every little change of where the arm stands: from random starts nobody
-could learn it (docs/experiments/simple-ways.md). Two postures cost a step or three.
+And where the arm may start anywhere, it goes there in one of two postures, the elbow straight above
+the line from shoulder to wrist, A1 towards the target or away from it. The expert chooses the
+soonest of some two thousand, and which that is jumps with every little change of where the arm
+stands: nobody could learn it (docs/experiments/simple-ways.md). Two postures cost three steps.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.datasets.expert import CLEARANCE_M, Expert
+from hvs_suite.tasks.variants import TASKS
 
 if TYPE_CHECKING:
     from hvs_suite.cell.environment import Environment
@@ -35,6 +36,8 @@ LOOK_OUT_RAD: FloatArray = np.array([1.75, 0.8, 0.0, -0.6, 0.0, 0.6, 0.0])
 """Where the arm goes to look (rad), chosen for the fewest steps (docs/experiments/look-out.md)."""
 
 
+PLAIN_SWIVELS = 1
+"""The elbow straight above: two postures within reach, as a rule."""
 LOOK_DOWN_M = 0.15
 """How far above the goal the eye in the hand looks for the target (m): high enough to have it in
 view wherever the eye-to-hand camera may take it to be, and hardly a detour."""
@@ -43,11 +46,13 @@ view wherever the eye-to-hand camera may take it to be, and hardly a detour."""
 class Demonstrator(Expert):
     """Answers with the action that a policy should learn; one episode at a time."""
 
-    n_swivel = 1
-
     def __init__(self, env: Environment) -> None:
         super().__init__(env)
         variant = env.variant
+        named = TASKS.get(variant.name)
+        starts = {variant.start, named.start if named is not None else variant.start}
+        if "random" in starts:
+            self.n_swivel = PLAIN_SWIVELS
         self._looks_down = variant.eth_position_noise_m > 0 or variant.eth_rotation_noise_deg > 0
         self.reset()
 
