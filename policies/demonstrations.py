@@ -211,11 +211,12 @@ class FramePool:
         )
         return Recording({**recording.columns, MEMORY: memory}, recording.images)
 
-    def batch(self, indices: npt.NDArray[np.int64]) -> dict[str, Tensor]:
+    def batch(self, indices: npt.NDArray[np.int64], *, pictures: bool = True) -> dict[str, Tensor]:
         """Frames as LeRobot's loader would give them, but for images left as bytes.
 
         Args:
             indices: Of the frames, (B,).
+            pictures: Whether images are wanted; the numbers alone cost next to nothing.
 
         Returns:
             Images (B, C, H, W) uint8, and float32 the recordings' columns and ``memory``.
@@ -232,7 +233,7 @@ class FramePool:
             for key in first.columns
             if key != EPISODE
         }
-        for key, frames in first.images.items():
+        for key, frames in first.images.items() if pictures else ():
             images = torch.empty((len(indices), *frames.shape[1:]), dtype=torch.uint8)
             begin = 0
             for recording, rows in parts:

@@ -45,6 +45,7 @@ WARMUP_SHARE = 0.03
 GRADIENT_NORM = 1.0
 # Philox words that keep this stream apart from the held-out choice.
 ORDER_STREAM = 2
+REHEARSAL_STREAM = 5
 HELD_OUT_BATCH = 128
 HELD_OUT_FRAMES = 512
 LOG_EVERY_STEPS = 20
@@ -117,6 +118,7 @@ def pretrain(
     dagger_frames: int = 6000,
     inputs: tuple[str, ...] | None = None,
     episodes: int | None = None,
+    rehearsal_frames: int = 512,
     keypoint_weight: float = 1.0,
     error_scale: float | None = None,
     workers: int = 2,
@@ -139,6 +141,8 @@ def pretrain(
         dagger_frames: Frames a round.
         inputs: What the policy is given, of ``eih``, ``eth`` and ``joints``; None for all.
         episodes: Learn from the first so many demonstrations alone; None from all.
+        rehearsal_frames: Frames a step that the head alone learns from, without their images; see
+            `hvs_suite.policies.hvs.rehearsal`.
         keypoint_weight: Weight of the supervision by ``privileged.*``; 0 trains on actions alone.
         error_scale: See `HvsConfig`; None for five times the task's tightest tolerance.
         workers: Processes that play the rounds; any number gives the same.
@@ -168,6 +172,7 @@ def pretrain(
         task=manifest.task,
         inputs=inputs,
         episodes=episodes,
+        rehearsal_frames=rehearsal_frames,
         keypoint_weight=keypoint_weight,
         error_scale=tightest_scale(manifest) if error_scale is None else error_scale,
     )
@@ -318,6 +323,10 @@ class _Run:
                 batch = demonstrations.batch(order.indices(step))
                 self._data_s += time.perf_counter() - fetched
                 loss, parts = policy(batch)
+                if settings.rehearsal_frames:
+                    extra = _rehearse(policy, demonstrations, settings, step)
+                    parts["rehearsal_loss"] = extra.item()
+                    loss = loss + extra
                 optimizer.zero_grad()
                 loss.backward()
                 torch.nn.utils.clip_grad_norm_(policy.parameters(), GRADIENT_NORM)
@@ -462,6 +471,17 @@ class _Order:
             self._shuffled = np.random.Generator(key).permutation(self._pool)
             self._pass = number
         return self._shuffled
+
+
+def _rehearse(
+    policy: "HvsPolicy", demonstrations: Demonstrations, settings: Settings, step: int
+) -> torch.Tensor:
+    """Loss of the head on frames of this step's own draw, whose images stay on the disk."""
+    key = np.random.Philox(key=[settings.seed, REHEARSAL_STREAM], counter=step)
+    random = np.random.Generator(key)
+    indices = random.choice(demonstrations.training, settings.rehearsal_frames)
+    generator = torch.Generator().manual_seed(int(random.integers(2**32)))
+    return policy.rehearse(demonstrations.batch(indices, pictures=False), generator)
 
 
 def _schedule(share: float) -> float:

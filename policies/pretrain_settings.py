@@ -30,6 +30,7 @@ class Settings:
         task: Named task that it was recorded on.
         inputs: What the policy is given; None for all.
         episodes: Learn from the first so many demonstrations alone; None from all.
+        rehearsal_frames: Frames a step that the head alone learns from.
         keypoint_weight: Of the policy.
         error_scale: Of the policy.
     """
@@ -43,6 +44,7 @@ class Settings:
     task: str
     inputs: tuple[str, ...] | None
     episodes: int | None
+    rehearsal_frames: int
     keypoint_weight: float
     error_scale: float
 
@@ -60,8 +62,9 @@ class Settings:
                 raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not 0.0 < self.learning_rate < 1.0:
             raise OptionError(f"learning_rate must be between 0 and 1, not {self.learning_rate}")
-        if self.dagger_rounds < 0:
-            raise OptionError(f"dagger_rounds must be 0 or more, not {self.dagger_rounds}")
+        for name in ("dagger_rounds", "rehearsal_frames"):
+            if getattr(self, name) < 0:
+                raise OptionError(f"{name} must be 0 or more, not {getattr(self, name)}")
         if self.episodes is not None and not 1 <= self.episodes <= manifest.n_episodes:
             raise OptionError(
                 f"episodes must be 1 to the dataset's {manifest.n_episodes}, not {self.episodes}"

@@ -33,6 +33,7 @@ class Pretrain:
         inputs: What the policy is given: names joined by +, such as eih+joints; all of eih, eth
             and joints by default.
         episodes: Learn from the first so many demonstrations alone.
+        rehearsal_frames: Frames a step that the head alone learns from, without their images.
         keypoint_weight: Weight of the supervision by where the target is; 0 trains on actions.
         error_scale: Errors of a joint's step (rad) and of a place (m) weigh linearly below this
             and logarithmically above; five times the task's tightest tolerance by default.
@@ -48,6 +49,7 @@ class Pretrain:
     dagger_frames: int = 6000
     inputs: str | None = None
     episodes: int | None = None
+    rehearsal_frames: int = 512
     keypoint_weight: float = 1.0
     error_scale: float | None = None
     workers: int = 2
@@ -70,6 +72,7 @@ class Pretrain:
                 dagger_frames=self.dagger_frames,
                 inputs=None if self.inputs is None else tuple(self.inputs.split("+")),
                 episodes=self.episodes,
+                rehearsal_frames=self.rehearsal_frames,
                 keypoint_weight=self.keypoint_weight,
                 error_scale=self.error_scale,
                 workers=self.workers,

@@ -14,12 +14,15 @@ from hvs_suite.policies.hvs.configuration_hvs import HvsConfig
 from hvs_suite.policies.hvs.network import (
     IMAGE_PREFIX,
     MEMORY,
+    Decision,
     HvsNetwork,
+    Sighting,
     action_loss,
     flange_loss,
     sighting_loss,
     target_loss,
 )
+from hvs_suite.policies.hvs.rehearsal import drawn_sightings
 
 GOAL_POSITION = "privileged.goal_position"
 GOAL_NORMAL = "privileged.goal_normal"
@@ -48,6 +51,8 @@ class HvsPolicy(PreTrainedPolicy):
         self.network = HvsNetwork(config.shape())
         self._warned = False
         self._memory: Tensor | None = None
+        # What the eyes made of the last batch, and where the targets were.
+        self._seen: tuple[dict[str, Sighting], dict[str, Tensor]] = {}, {}
         if dataset_meta is not None and not config.pretrained_path:
             self._calibrate_from(Path(dataset_meta.root))
 
@@ -82,41 +87,75 @@ class HvsPolicy(PreTrainedPolicy):
         """
         images, state = self._inputs(batch)
         decision = self.network(images, state, batch.get(MEMORY))
-        out, sightings, target = decision.out, decision.sightings, decision.target
-        label = self.network.encode_label(batch[ACTION], state)
-        loss = action_loss(out, label)
-        parts = {"action_loss": loss.detach()}
+        loss, parts = self._control_loss(decision, batch, state)
         weight = self.config.keypoint_weight
-        supervised = False
-        for camera, sighting in sightings.items():
-            truth = batch.get(TARGET_PREFIX + camera)
-            if weight > 0 and truth is not None:
-                part = sighting_loss(sighting, truth)
-                parts[f"{camera}_loss"] = part.detach()
-                loss = loss + weight * part
-                supervised = True
+        truths = self._truths(batch) if weight > 0 else {}
+        for camera, truth in truths.items():
+            part = sighting_loss(decision.sightings[camera], truth)
+            parts[f"{camera}_loss"] = part.detach()
+            loss = loss + weight * part
+        target = decision.target
         if weight > 0 and target is not None and GOAL_POSITION in batch and GOAL_NORMAL in batch:
-            truth = batch[GOAL_POSITION] - self.network.standoff * batch[GOAL_NORMAL]
-            part = target_loss(target, truth, self.config.error_scale)
+            place = batch[GOAL_POSITION] - self.network.standoff * batch[GOAL_NORMAL]
+            part = target_loss(target, place, self.config.error_scale)
             parts["target_loss"] = part.detach()
             loss = loss + 0.1 * weight * part
-            if decision.motion is not None:
-                astray = self.network.to_step(out) - self.network.to_step(label)
-                distance = batch[GOAL_POSITION] - decision.motion.position
-                part = flange_loss(
-                    astray,
-                    decision.motion,
-                    distance.norm(dim=1, keepdim=True),
-                    self.config.error_scale,
-                )
-                parts["flange_loss"] = part.detach()
-                loss = loss + 0.3 * part
-        if self.training and weight > 0 and not supervised and not self._warned:
+        if self.training and weight > 0 and not truths and not self._warned:
             logger.warning(
                 "training without keypoint supervision: the batch has no `privileged.target_*`"
             )
             self._warned = True
+        self._seen = (decision.sightings, truths)
         return loss, {name: part.item() for name, part in parts.items()}
+
+    def rehearse(self, batch: dict[str, Tensor], generator: torch.Generator) -> Tensor:
+        """Loss of the head on frames without images, see `hvs_suite.policies.hvs.rehearsal`.
+
+        Args:
+            batch: As in `forward`, which is to be called before: from what the eyes made of those
+                frames it is drawn what they would have made of these.
+            generator: For these draws.
+
+        Returns:
+            The loss; 0 where nobody says where the targets are.
+        """
+        sightings, truths = self._seen
+        state = batch[OBS_STATE] if self.network.shape.state_dim else None
+        if set(truths) != set(self.network.shape.cameras) or state is None:
+            return self.network.step_gain.new_zeros(())
+        drawn = drawn_sightings(sightings, truths, self._truths(batch), generator)
+        decision = self.network.decide(drawn, state, batch.get(MEMORY))
+        return self._control_loss(decision, batch, state)[0]
+
+    def _control_loss(
+        self, decision: Decision, batch: dict[str, Tensor], state: Tensor | None
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Loss of the expert's step, joint by joint and at the flange, and its parts."""
+        label = self.network.encode_label(batch[ACTION], state)
+        loss = action_loss(decision.out, label)
+        parts = {"action_loss": loss.detach()}
+        if (
+            self.config.keypoint_weight > 0
+            and decision.motion is not None
+            and GOAL_POSITION in batch
+            and GOAL_NORMAL in batch
+        ):
+            astray = self.network.to_step(decision.out) - self.network.to_step(label)
+            distance = batch[GOAL_POSITION] - decision.motion.position
+            part = flange_loss(
+                astray,
+                decision.motion,
+                distance.norm(dim=1, keepdim=True),
+                self.config.error_scale,
+            )
+            parts["flange_loss"] = part.detach()
+            loss = loss + 0.3 * part
+        return loss, parts
+
+    def _truths(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Where the target is in each camera's images, as far as the batch tells."""
+        keys = {camera: TARGET_PREFIX + camera for camera in self.network.shape.cameras}
+        return {camera: batch[key] for camera, key in keys.items() if key in batch}
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:

@@ -382,12 +382,21 @@ class HvsNetwork(nn.Module):
         """
         # Half a millimetre at the flange is 1e-3 rad: nothing here may be rounded by autocast.
         with torch.autocast(self.joint_range.device.type, enabled=False):
-            return self._decide(images, state, memory)
+            return self.decide(self.look(images), state, memory)
 
-    def _decide(
-        self, images: Mapping[str, Tensor], state: Tensor | None, memory: Tensor | None
+    def decide(
+        self, sightings: dict[str, Sighting], state: Tensor | None, memory: Tensor | None = None
     ) -> Decision:
-        sightings = self.look(images)
+        """Decide on what the eyes make of the images.
+
+        Args:
+            sightings: As `look` returns them.
+            state: As in `forward`.
+            memory: As in `forward`.
+
+        Returns:
+            The decision.
+        """
         features = [s.features() for s in sightings.values()]
         if state is None:
             out, known = self._say(features, 0.0)
