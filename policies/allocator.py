@@ -13,8 +13,8 @@ def keep_freed_memory() -> None:
     """Ask the C library to keep large blocks instead of handing them back to the system.
 
     A batch of images and its features are hundreds of megabytes. Taken from the system anew at
-    every step, their pages have to be cleared and mapped again, which took as long as the
-    convolutions. Without glibc nothing happens.
+    every step, their pages have to be cleared and mapped again, which took a third of a step on
+    images of 512 px. Without glibc nothing happens.
     """
     if not sys.platform.startswith("linux"):
         return

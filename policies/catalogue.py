@@ -53,8 +53,9 @@ def checkpoint_folder(spec: str, task: str) -> Path:
     if spec in SHIPPED:
         folder = HERE / spec / trained_on(task)
         if not folder.is_dir():
+            command = "hvs pretrain" if spec == "pretrained" else "hvs finetune"
             raise PolicyError(
-                f"this version ships no {spec} weights for {task}; train your own with hvs pretrain"
+                f"this version ships no {spec} weights for {task}; train your own with {command}"
             )
         return folder
     if Path(spec).is_dir():

@@ -50,7 +50,7 @@ def round_shares(rounds: int) -> list[float]:
 
 
 @dataclasses.dataclass(frozen=True)
-class CorrectedEpisode:
+class PlayedEpisode:
     """An episode that the policy played.
 
     Attributes:
@@ -66,7 +66,7 @@ class CorrectedEpisode:
     collision: bool
 
 
-def watch(env: "Environment", policy: Policy, scenario: int) -> CorrectedEpisode:
+def watch(env: "Environment", policy: Policy, scenario: int) -> PlayedEpisode:
     """Play one scenario with the policy and keep what it saw, asking no expert.
 
     Args:
@@ -80,7 +80,7 @@ def watch(env: "Environment", policy: Policy, scenario: int) -> CorrectedEpisode
     return _played(env, policy, scenario, dict)
 
 
-def correct(env: "Environment", policy: Policy, scenario: int) -> CorrectedEpisode:
+def correct(env: "Environment", policy: Policy, scenario: int) -> PlayedEpisode:
     """Play one scenario with the policy and label each frame by the expert.
 
     Args:
@@ -97,7 +97,7 @@ def correct(env: "Environment", policy: Policy, scenario: int) -> CorrectedEpiso
 
 def _played(
     env: "Environment", policy: Policy, scenario: int, label: Callable[[], Frame]
-) -> CorrectedEpisode:
+) -> PlayedEpisode:
     time_step = env.reset(scenario=scenario)
     policy.reset()
     frames: list[Frame] = []
@@ -107,7 +107,7 @@ def _played(
         action = np.clip(policy.select_action(time_step.observation), -1.0, 1.0)
         time_step = env.step(action.astype(np.float32))
     info = env.info
-    return CorrectedEpisode(scenario, frames, info["is_success"], info["collision"])
+    return PlayedEpisode(scenario, frames, info["is_success"], info["collision"])
 
 
 @dataclasses.dataclass(frozen=True)

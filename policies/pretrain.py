@@ -38,7 +38,7 @@ from hvs_suite.policies.training_plot import draw_run
 from hvs_suite.policies.training_state import Counters, load_state, save_state
 
 if TYPE_CHECKING:
-    from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
+    from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy, Lesson
 
 PACKAGES = ("hvs-suite", "lerobot", "numpy", "torch")
 WARMUP_SHARE = 0.03
@@ -322,13 +322,14 @@ class _Run:
                 fetched = time.perf_counter()
                 batch = demonstrations.batch(order.indices(step))
                 self._data_s += time.perf_counter() - fetched
-                loss, parts = policy(batch)
+                lesson = policy.supervise(batch)
+                loss, parts = lesson.loss, lesson.parts
                 if settings.rehearsal_frames:
-                    extra = _rehearse(policy, demonstrations, settings, step)
+                    extra = _rehearse(policy, demonstrations, lesson, settings, step)
                     parts["rehearsal_loss"] = extra.item()
                     loss = loss + extra
                 optimizer.zero_grad()
-                loss.backward()
+                loss.backward()  # type: ignore[no-untyped-call]
                 torch.nn.utils.clip_grad_norm_(policy.parameters(), GRADIENT_NORM)
                 optimizer.step()
 
@@ -474,14 +475,18 @@ class _Order:
 
 
 def _rehearse(
-    policy: "HvsPolicy", demonstrations: Demonstrations, settings: Settings, step: int
+    policy: "HvsPolicy",
+    demonstrations: Demonstrations,
+    lesson: "Lesson",
+    settings: Settings,
+    step: int,
 ) -> torch.Tensor:
     """Loss of the head on frames of this step's own draw, whose images stay on the disk."""
     key = np.random.Philox(key=[settings.seed, REHEARSAL_STREAM], counter=step)
     random = np.random.Generator(key)
     indices = random.choice(demonstrations.training, settings.rehearsal_frames)
     generator = torch.Generator().manual_seed(int(random.integers(2**32)))
-    return policy.rehearse(demonstrations.batch(indices, pictures=False), generator)
+    return policy.rehearse(demonstrations.batch(indices, pictures=False), lesson, generator)
 
 
 def _schedule(share: float) -> float:

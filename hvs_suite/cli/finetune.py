@@ -1,12 +1,11 @@
 """``hvs finetune``: a pretrained policy, made better by reinforcement learning."""
 
 import dataclasses
+import functools
 from pathlib import Path
 from typing import Literal
 
-from hvs_suite.cli import console
-
-DEFAULT_MINUTES = 40.0
+from hvs_suite.cli.rl_session import show_run
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -81,22 +80,14 @@ class Finetune:
         base = checkpoint_folder(self.policy, self.task)
         from hvs_suite.policies.finetune.training import finetune
 
-        minutes = self.minutes
-        if minutes is None and self.steps is None:
-            minutes = DEFAULT_MINUTES
-        with console.meter() as update:
-            outcome = finetune(
-                base,
-                self.task,
-                self.out,
-                minutes=minutes,
-                steps=self.steps,
-                seed=self.seed,
-                settings=settings,
-                curriculum=self.curriculum,
-                eval_every=self.eval_every,
-                eval_episodes=self.eval_episodes,
-                on_progress=lambda state: update(state.stage, state.share, state.in_words()),
-            )
-        print(outcome.in_words())
-        print(f"wrote {self.out}")
+        show_run(
+            functools.partial(finetune, base, self.task, self.out),
+            self.out,
+            minutes=self.minutes,
+            steps=self.steps,
+            seed=self.seed,
+            settings=settings,
+            curriculum=self.curriculum,
+            eval_every=self.eval_every,
+            eval_episodes=self.eval_episodes,
+        )

@@ -1,11 +1,10 @@
 """``hvs train-sac``: the thesis's baseline, soft actor-critic from scratch."""
 
 import dataclasses
+import functools
 from pathlib import Path
 
-from hvs_suite.cli import console
-
-DEFAULT_MINUTES = 40.0
+from hvs_suite.cli.rl_session import show_run
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -72,22 +71,15 @@ class TrainSac:
         from hvs_suite.policies.sac.training import train_sac
         from hvs_suite.tasks.variants import THESIS_REWARDS
 
-        minutes = self.minutes
-        if minutes is None and self.steps is None:
-            minutes = DEFAULT_MINUTES
-        with console.meter() as update:
-            outcome = train_sac(
-                self.task,
-                self.out,
-                minutes=minutes,
-                steps=self.steps,
-                seed=self.seed,
-                settings=settings,
-                rewards=self.reward or THESIS_REWARDS,
-                eval_every=self.eval_every,
-                eval_episodes=self.eval_episodes,
-                device=self.device,
-                on_progress=lambda state: update(state.stage, state.share, state.in_words()),
-            )
-        print(outcome.in_words())
-        print(f"wrote {self.out}")
+        show_run(
+            functools.partial(train_sac, self.task, self.out),
+            self.out,
+            minutes=self.minutes,
+            steps=self.steps,
+            seed=self.seed,
+            settings=settings,
+            rewards=self.reward or THESIS_REWARDS,
+            eval_every=self.eval_every,
+            eval_episodes=self.eval_episodes,
+            device=self.device,
+        )

@@ -20,7 +20,7 @@ from stable_baselines3.td3.policies import Actor, MultiInputPolicy
 from torch import Tensor, nn
 
 from hvs_suite.policies.finetune.stage import FEATURES, PRIVILEGED
-from hvs_suite.policies.hvs.network import N_JOINTS, make_residual
+from hvs_suite.policies.hvs.network import N_JOINTS, make_residual, normed_layers
 
 N_TARGET_CRITICS = 2
 
@@ -67,7 +67,10 @@ class ResidualPolicy(MultiInputPolicy):
         keys = Keys(self._dict_space(), (FEATURES, PRIVILEGED))
         critic = ContinuousCritic(**{**self.critic_kwargs, **_extracted(keys)})
         n_inputs, [hidden, *_] = keys.features_dim + N_JOINTS, self.actor.net_arch
-        critic.q_networks = [_value(n_inputs, hidden) for _ in critic.q_networks]
+        critic.q_networks = [
+            nn.Sequential(*normed_layers(n_inputs, hidden), nn.Linear(hidden, 1))
+            for _ in critic.q_networks
+        ]
         for index, network in enumerate(critic.q_networks):
             critic.add_module(f"qf{index}", network)
         return critic.to(self.device)
@@ -137,18 +140,6 @@ class ResidualTD3(TD3):
         if actor_losses:
             self.logger.record("train/actor_loss", _mean(actor_losses))
             self.logger.record("train/residual", _mean(sizes))
-
-
-def _value(n_inputs: int, hidden: int) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Linear(n_inputs, hidden),
-        nn.LayerNorm(hidden),
-        nn.ReLU(),
-        nn.Linear(hidden, hidden),
-        nn.LayerNorm(hidden),
-        nn.ReLU(),
-        nn.Linear(hidden, 1),
-    )
 
 
 def _extracted(keys: Keys) -> dict[str, Any]:

@@ -55,7 +55,7 @@ class Settings:
     critics: int = 4
     hidden: int = 256
     shaping: float = 0.05
-    eye_rounds: int = 0
+    eye_rounds: int = 2
     eye_frames: int = 6_000
     eye_steps: int = 1_000
     eye_rate: float = 5e-4

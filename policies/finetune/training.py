@@ -1,8 +1,8 @@
 """RL fine-tuning of a pretrained `hvs` policy: eyes on its own frames, then TD3 on a residual.
 
-A run starts exactly at its base's success, and leaves one `hvs` checkpoint that needs nothing
-privileged. It is a function of base, task, settings, seed and number of steps. Killed, it goes on
-from its last checkpoint when the same command is given again.
+RL starts exactly at the success of what plays, the base with its new eyes, and leaves one `hvs`
+checkpoint that needs nothing privileged. A run is a function of base, task, settings, seed and
+number of steps. Killed, it goes on from its last checkpoint when the same command is given again.
 """
 
 import contextlib
@@ -22,7 +22,6 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
-from hvs_suite.errors import OptionError
 from hvs_suite.policies.allocator import keep_freed_memory
 from hvs_suite.policies.checkpoint import CheckpointPolicy, check_fit, read_config
 from hvs_suite.policies.finetune.eyes import train_eyes
@@ -34,11 +33,10 @@ from hvs_suite.policies.hvs.network import N_JOINTS
 from hvs_suite.policies.rl.curriculum import Curriculum, Kind, levels_of
 from hvs_suite.policies.rl.evaluation import Examiner
 from hvs_suite.policies.rl.journal import OUTCOMES, Journal
-from hvs_suite.policies.rl.run import Budget, Outcome, Progress, Run
+from hvs_suite.policies.rl.run import Budget, Outcome, Progress, Run, check_run
 from hvs_suite.policies.run_folder import claim, write_train_config
 from hvs_suite.registry import find
 from hvs_suite.rollout import library_seeds, worker_conditions
-from hvs_suite.tasks.scenario import TEST_SPLIT
 from hvs_suite.tasks.variants import AlignVariant, with_options
 
 PACKAGES = ("hvs-suite", "mujoco", "numpy", "stable-baselines3", "torch")
@@ -95,13 +93,7 @@ def finetune(
     options = dict(options or {})
     variant = with_options(find(task), options)
     limit = Budget(steps, minutes)
-    if not 0 <= seed < 2**32:
-        raise OptionError(f"seed must be from 0 to 2^32 - 1, not {seed}")
-    if split == TEST_SPLIT:
-        raise OptionError(f"split {TEST_SPLIT!r} is for scoring; train on another, such as train")
-    for name, count in (("eval_every", eval_every), ("eval_episodes", eval_episodes)):
-        if count < 1:
-            raise OptionError(f"{name} must be at least 1, not {count}")
+    check_run(seed, split, eval_every, eval_episodes)
     levels = levels_of(task, curriculum) if curriculum is not None else [{}]
     check_fit(read_config(policy), policy, variant)
     load_base(policy)

@@ -154,7 +154,7 @@ def postures(goal: Tensor) -> Tensor:
         towards = torch.atan2(goal[:, 1], goal[:, 0])
         zero = torch.zeros_like(out)
         plane = torch.stack([shoulder, zero, -bend, zero, torch.pi - shoulder - bend], dim=1)
-        away = towards - torch.pi * torch.sign(towards)
+        away = towards + torch.where(towards > 0, -torch.pi, torch.pi)
         one = torch.cat([towards[:, None], plane], dim=1)
         other = torch.cat([away[:, None], -plane], dim=1)
         return torch.stack([one, other], dim=1)

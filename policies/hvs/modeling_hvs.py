@@ -1,5 +1,6 @@
 """The `hvs` network behind LeRobot's policy interface."""
 
+import dataclasses
 import json
 import logging
 from pathlib import Path
@@ -31,6 +32,24 @@ TARGET_PREFIX = "privileged.target_"
 logger = logging.getLogger(__name__)
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Lesson:
+    """What a batch teaches.
+
+    Attributes:
+        loss: Scalar to learn from.
+        parts: What it is made of, as numbers.
+        sightings: Camera name to what its eye made of the batch.
+        truths: Camera name to where the target was: u, v, apparent diameter in image widths, and 1
+            where it can be seen, (B, 4); empty without keypoint supervision.
+    """
+
+    loss: Tensor
+    parts: dict[str, float]
+    sightings: dict[str, Sighting]
+    truths: dict[str, Tensor]
+
+
 class HvsPolicy(PreTrainedPolicy):
     """Two images and the joints in, seven joint position targets out.
 
@@ -51,8 +70,6 @@ class HvsPolicy(PreTrainedPolicy):
         self.network = HvsNetwork(config.shape())
         self._warned = False
         self._memory: Tensor | None = None
-        # What the eyes made of the last batch, and where the targets were.
-        self._seen: tuple[dict[str, Sighting], dict[str, Tensor]] = {}, {}
         if dataset_meta is not None and not config.pretrained_path:
             self._calibrate_from(Path(dataset_meta.root))
 
@@ -74,16 +91,29 @@ class HvsPolicy(PreTrainedPolicy):
         self._memory = None
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
-        """Loss of a batch.
+        """Loss of a batch; LeRobot's interface to `supervise`.
+
+        Args:
+            batch: As `supervise` takes it.
+
+        Returns:
+            The loss, and its parts as numbers.
+        """
+        lesson = self.supervise(batch)
+        return lesson.loss, lesson.parts
+
+    def supervise(self, batch: dict[str, Tensor]) -> Lesson:
+        """Hold what the network makes of a batch against what is true.
 
         Args:
             batch: The inputs (images uint8, or float in [0, 1]), ``action`` (B, 7), and where the
                 dataset has them ``privileged.target_<camera>`` (B, 4),
                 ``privileged.goal_position`` and ``privileged.goal_normal`` (B, 3); ``memory``
-                (B, 4) where the target was seen earlier in the episode, empty if it is missing.
+                (B, 4 n) where each of n cameras saw the target earlier in the episode, empty if it
+                is missing.
 
         Returns:
-            The loss, and its parts as numbers.
+            The loss, and what else can be learned from it.
         """
         images, state = self._inputs(batch)
         decision = self.network(images, state, batch.get(MEMORY))
@@ -105,25 +135,27 @@ class HvsPolicy(PreTrainedPolicy):
                 "training without keypoint supervision: the batch has no `privileged.target_*`"
             )
             self._warned = True
-        self._seen = (decision.sightings, truths)
-        return loss, {name: part.item() for name, part in parts.items()}
+        numbers = {name: part.item() for name, part in parts.items()}
+        return Lesson(loss, numbers, decision.sightings, truths)
 
-    def rehearse(self, batch: dict[str, Tensor], generator: torch.Generator) -> Tensor:
+    def rehearse(
+        self, batch: dict[str, Tensor], lesson: Lesson, generator: torch.Generator
+    ) -> Tensor:
         """Loss of the head on frames without images, see `hvs_suite.policies.hvs.rehearsal`.
 
         Args:
-            batch: As in `forward`, which is to be called before: from what the eyes made of those
-                frames it is drawn what they would have made of these.
-            generator: For these draws.
+            batch: As in `supervise`, images left out.
+            lesson: From other frames: what the eyes made of those decides what they would have made
+                of these.
+            generator: For the draws.
 
         Returns:
             The loss; 0 where nobody says where the targets are.
         """
-        sightings, truths = self._seen
         state = batch[OBS_STATE] if self.network.shape.state_dim else None
-        if set(truths) != set(self.network.shape.cameras) or state is None:
+        if set(lesson.truths) != set(self.network.shape.cameras) or state is None:
             return self.network.step_gain.new_zeros(())
-        drawn = drawn_sightings(sightings, truths, self._truths(batch), generator)
+        drawn = drawn_sightings(lesson.sightings, lesson.truths, self._truths(batch), generator)
         decision = self.network.decide(drawn, state, batch.get(MEMORY))
         return self._control_loss(decision, batch, state)[0]
 

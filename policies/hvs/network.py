@@ -45,8 +45,10 @@ POSITIONS_AND_VELOCITIES = 2 * N_JOINTS
 SEEN_LOGIT = 2.0
 """How sure an eye must be (as a logit) that it sees the target before its place is remembered."""
 NEVER_LOGIT = -20.0
+"""What cannot be in view at all: its weight is below a float's precision beside any other."""
 ESTIMATE_FEATURES = 7
 N_POSTURES = 2
+"""Of `geometry.postures`."""
 POSTURE_FEATURES = 8
 
 
@@ -431,7 +433,11 @@ class HvsNetwork(nn.Module):
         """What the head reads of the ways to the plain postures, (B, 8) each.
 
         The turns of A1 to A6 that are left, on the logarithmic scale, the time of the slowest at
-        full speed (s), and whether A1 can turn so far at all.
+        full speed (s), and whether the posture lies within the joint ranges.
+
+        Args:
+            q: Measured joint positions, (B, 7) rad.
+            goals: Angles of A1 to A6, (B, 2, 6) rad.
         """
         found = []
         for goal in goals.unbind(dim=1):
@@ -439,7 +445,7 @@ class HvsNetwork(nn.Module):
             time = (way.abs() / self.joint_speed[:-1]).amax(dim=1, keepdim=True)
             reachable = (goal.abs() <= self.joint_range[:-1]).all(dim=1, keepdim=True)
             scaled = torch.asinh(way / self.shape.error_scale)
-            found += [torch.cat([scaled, time, reachable.to(q.dtype)], dim=1)]
+            found.append(torch.cat([scaled, time, reachable.to(q.dtype)], dim=1))
         return found
 
     def _say(self, features: list[Tensor], step: Tensor | float) -> tuple[Tensor, Tensor]:
@@ -542,16 +548,24 @@ def make_residual(n_features: int, hidden: int) -> nn.Sequential:
     last = nn.Linear(hidden, N_JOINTS)
     nn.init.zeros_(last.weight)
     nn.init.zeros_(last.bias)
-    return nn.Sequential(
-        nn.Linear(n_features, hidden),
+    return nn.Sequential(*normed_layers(n_features, hidden), last, nn.Tanh())
+
+
+def normed_layers(n_inputs: int, hidden: int) -> list[nn.Module]:
+    """Two dense layers with layer norm, as residual and critics have them.
+
+    Args:
+        n_inputs: Numbers that the first reads.
+        hidden: Width of both.
+    """
+    return [
+        nn.Linear(n_inputs, hidden),
         nn.LayerNorm(hidden),
         nn.ReLU(),
         nn.Linear(hidden, hidden),
         nn.LayerNorm(hidden),
         nn.ReLU(),
-        last,
-        nn.Tanh(),
-    )
+    ]
 
 
 def action_loss(out: Tensor, label: Tensor) -> Tensor:

@@ -29,6 +29,7 @@ from hvs_suite.policies.rl.journal import OUTCOMES
 from hvs_suite.policies.rl.plot import draw_rl_run
 from hvs_suite.policies.rl.state import Counters, Model, load_run, save_run
 from hvs_suite.rollout import Policy
+from hvs_suite.tasks.scenario import TEST_SPLIT
 
 LOG_EVERY = 10
 """Iterations between two points of a curve."""
@@ -160,6 +161,27 @@ class Budget:
         if self.minutes is not None:
             shares.append(elapsed_s / (60.0 * self.minutes))
         return max(shares)
+
+
+def check_run(seed: int, split: str, eval_every: int, eval_episodes: int) -> None:
+    """Refuse what no RL run can be made with.
+
+    Args:
+        seed: Of the run.
+        split: Stream of scenes to learn from.
+        eval_every: Environment steps between evaluations.
+        eval_episodes: Scenes an evaluation.
+
+    Raises:
+        OptionError: A value makes no sense, or the split is the one that scores.
+    """
+    if not 0 <= seed < 2**32:
+        raise OptionError(f"seed must be from 0 to 2^32 - 1, not {seed}")
+    if split == TEST_SPLIT:
+        raise OptionError(f"split {TEST_SPLIT!r} is for scoring; train on another, such as train")
+    for name, count in (("eval_every", eval_every), ("eval_episodes", eval_episodes)):
+        if count < 1:
+            raise OptionError(f"{name} must be at least 1, not {count}")
 
 
 class Run:

@@ -19,14 +19,13 @@ from hvs_suite.errors import OptionError
 from hvs_suite.policies.allocator import keep_freed_memory
 from hvs_suite.policies.rl.evaluation import Examiner
 from hvs_suite.policies.rl.journal import Journal, make_journal
-from hvs_suite.policies.rl.run import Budget, Outcome, Progress, Run
+from hvs_suite.policies.rl.run import Budget, Outcome, Progress, Run, check_run
 from hvs_suite.policies.run_folder import claim, write_train_config
 from hvs_suite.policies.sac.network import policy_kwargs
 from hvs_suite.policies.sac.playing import GreedyActor, save_actor, write_config
 from hvs_suite.policies.sac.settings import Settings
 from hvs_suite.registry import find
 from hvs_suite.rollout import library_seeds
-from hvs_suite.tasks.scenario import TEST_SPLIT
 from hvs_suite.tasks.variants import (
     PRESETS,
     THESIS_REWARDS,
@@ -88,7 +87,8 @@ def train_sac(
     options = {**(options or {}), "rewards": tuple(rewards)}
     variant = with_options(find(task), options)
     limit = Budget(steps, minutes)
-    _check(variant, seed, split, eval_every, eval_episodes, device)
+    check_run(seed, split, eval_every, eval_episodes)
+    _check(variant, device)
     keep_freed_memory()
     torch.set_num_threads(min(2, torch.get_num_threads()))
     identity = {
@@ -157,21 +157,7 @@ def _make_model(journal: Journal, settings: Settings, seed: int, device: str) ->
     )
 
 
-def _check(
-    variant: AlignVariant,
-    seed: int,
-    split: str,
-    eval_every: int,
-    eval_episodes: int,
-    device: str,
-) -> None:
-    if not 0 <= seed < 2**32:
-        raise OptionError(f"seed must be from 0 to 2^32 - 1, not {seed}")
-    if split == TEST_SPLIT:
-        raise OptionError(f"split {TEST_SPLIT!r} is for scoring; train on another, such as train")
-    for name, count in (("eval_every", eval_every), ("eval_episodes", eval_episodes)):
-        if count < 1:
-            raise OptionError(f"{name} must be at least 1, not {count}")
+def _check(variant: AlignVariant, device: str) -> None:
     others = [name for name in observation_names(variant.observations) if name not in INPUTS]
     if others or variant.normalise_observation:
         raise OptionError(

@@ -169,7 +169,7 @@ def test_critics_warm_up_before_the_actor_moves(base, tmp_path):
     assert all(not value.any() for value in last)
 
 
-def test_a_run_begins_with_what_its_base_is_worth_and_counts_what_it_did(whole):
+def test_a_run_is_evaluated_before_it_learns_and_counts_what_it_did(whole):
     out, outcome, reports = whole
     assert outcome.env_steps == STEPS
     assert outcome.step == 2 * STEPS // 6

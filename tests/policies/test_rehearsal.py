@@ -70,10 +70,10 @@ def test_it_teaches_the_head_and_leaves_the_eyes_alone(dataset, tmp_path):
     )  # fmt: skip
     policy = new_policy(manifest, settings)
     demonstrations = Demonstrations(manifest, tmp_path / "cache", 0)
-    policy(demonstrations.batch(np.arange(8)))
+    lesson = policy.supervise(demonstrations.batch(np.arange(8)))
     batch = demonstrations.batch(np.arange(16), pictures=False)
     assert not [key for key in batch if ".images." in key]
-    policy.rehearse(batch, torch.Generator()).backward()
+    policy.rehearse(batch, lesson, torch.Generator()).backward()
     moved = {
         name.split(".")[1]
         for name, parameter in policy.named_parameters()
