@@ -64,8 +64,9 @@ def test_plain_postures_hold_the_flange_over_the_goal_facing_down():
         for posture in pair:
             q = np.append(posture, 0.0)
             rotation, position = kinematics().flange_pose(q)
-            np.testing.assert_allclose(position, goal[i], atol=1e-9)
-            np.testing.assert_allclose(rotation[:, 2], [0.0, 0.0, -1.0], atol=1e-9)
+            # Where the arm is nearly straight, rounding passes through an arc cosine near one.
+            np.testing.assert_allclose(position, goal[i], atol=1e-6)
+            np.testing.assert_allclose(rotation[:, 2], [0.0, 0.0, -1.0], atol=1e-6)
             within = (np.abs(q) <= JOINT_RANGE_RAD).all()
             assert within == any(np.abs(q - each).max() < 1e-6 for each in family)
 
