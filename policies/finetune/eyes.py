@@ -6,6 +6,7 @@ what the features have lost.
 """
 
 import math
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ from hvs_suite.policies.hvs.network import (
     sighting_loss,
     target_loss,
 )
+from hvs_suite.policies.rl.evaluation import Evaluation, read_evaluations, write_evaluations
 from hvs_suite.policies.rl.journal import SCENES_A_SEED
 from hvs_suite.tasks.variants import AlignVariant
 
@@ -52,29 +54,46 @@ def train_eyes(
     split: str,
     seed: int,
     settings: Settings,
+    examine: Callable[[Path, int, int], Evaluation],
     on_share: Callable[[str, float], None],
 ) -> Path:
     """Let the policy play and train its eyes on what it saw, round by round.
 
-    A round that was finished is not done again; one that was interrupted is.
+    A round that was finished is not done again; one that was interrupted is. Eyes with which fewer
+    scenes are solved than before are not kept.
 
     Args:
         base: Checkpoint to begin with.
-        folder: Gets a folder a round: its frames, and the checkpoint that came of it.
+        folder: Gets a folder a round: its frames, and the checkpoint that came of it; and
+            ``evaluations.json``, of the base and of each round.
         variant: The named task.
         options: Task options that differ from it.
         split: Stream of scenes.
         seed: Of the run.
         settings: How many rounds, frames and steps.
+        examine: Evaluates a checkpoint, given the frames played and the optimiser steps so far.
         on_share: Called with ``looking`` or ``training eyes``, and the share of it that is done.
 
     Returns:
-        The checkpoint of the last round; the base if there are none.
+        The checkpoint that solved most; of equals the last, and the base if there are no rounds.
     """
+    results = folder / "evaluations.json"
+    evaluations = read_evaluations(results, sys.maxsize)
+
+    def success_of(checkpoint: Path, number: int) -> float:
+        if len(evaluations) == number:
+            played, learned = number * settings.eye_frames, number * settings.eye_steps
+            evaluations.append(examine(checkpoint, played, learned))
+            write_evaluations(results, evaluations)
+        return evaluations[number].success_rate
+
     manifest = Manifest(folder, variant.name, split, options, dataset_features(variant), 0, 0)
     pool: FramePool | None = None
     scene = seed * SCENES_A_SEED + FIRST_SCENE
-    checkpoint = base
+    best = base
+    if settings.eye_rounds:
+        folder.mkdir(parents=True, exist_ok=True)
+        success = success_of(base, 0)
     for number in range(settings.eye_rounds):
         place = folder / f"round-{number + 1}"
         frames = place / "frames"
@@ -89,7 +108,7 @@ def train_eyes(
 
             play_round(
                 manifest,
-                checkpoint,
+                best,
                 frames,
                 frames=settings.eye_frames,
                 first_scenario=scene,
@@ -105,11 +124,13 @@ def train_eyes(
         pool.add(recording)
         improved = place / "checkpoint"
         if not (improved / "config.json").exists():
-            network = load_base(checkpoint)
+            network = load_base(best)
             _train(network, pool, settings, [seed, number], on_share)
-            write_folded(checkpoint, network, improved)
-        checkpoint = improved
-    return checkpoint
+            write_folded(best, network, improved)
+        solved = success_of(improved, number + 1)
+        if solved >= success:
+            best, success = improved, solved
+    return best
 
 
 def _train(

@@ -1,8 +1,9 @@
 """RL fine-tuning of a pretrained `hvs` policy: eyes on its own frames, then TD3 on a residual.
 
-RL starts exactly at the success of what plays, the base with its new eyes, and leaves one `hvs`
-checkpoint that needs nothing privileged. A run is a function of base, task, settings, seed and
-number of steps. Killed, it goes on from its last checkpoint when the same command is given again.
+RL starts exactly at the success of what plays, the base or, if that is no worse, the base with its
+new eyes, and leaves one `hvs` checkpoint that needs nothing privileged. A run is a function of
+base, task, settings, seed and number of steps. Killed, it goes on from its last checkpoint when the
+same command is given again.
 """
 
 import contextlib
@@ -31,7 +32,7 @@ from hvs_suite.policies.finetune.settings import Settings
 from hvs_suite.policies.finetune.stage import ResidualStage
 from hvs_suite.policies.hvs.network import N_JOINTS
 from hvs_suite.policies.rl.curriculum import Curriculum, Kind, levels_of
-from hvs_suite.policies.rl.evaluation import Examiner
+from hvs_suite.policies.rl.evaluation import Evaluation, Examiner
 from hvs_suite.policies.rl.journal import OUTCOMES, Journal
 from hvs_suite.policies.rl.run import Budget, Outcome, Progress, Run, check_run
 from hvs_suite.policies.run_folder import claim, write_train_config
@@ -121,15 +122,24 @@ def finetune(
     # Torch and SB3 draw from the global generators of NumPy and torch.
     with contextlib.ExitStack() as stack:
         stack.enter_context(library_seeds(seed))
+        examiner = stack.enter_context(
+            contextlib.closing(Examiner(variant, options, eval_episodes))
+        )
+
+        def examine(checkpoint: Path, frames: int, updates: int) -> Evaluation:
+            return examiner.evaluate(
+                CheckpointPolicy(checkpoint, variant),
+                frames,
+                updates,
+                on_episode=lambda done: on_eyes("evaluating", done / eval_episodes),
+            )
+
         base = train_eyes(
-            policy, training / "eyes", variant, options, split, seed, settings, on_eyes
+            policy, training / "eyes", variant, options, split, seed, settings, examine, on_eyes
         )
         environments = _environments(MakeStage(task, options, levels, split, base, settings, seed))
         stack.callback(environments.close)
         learner = _Finetuned(_make_model(environments, settings, seed), base, out, variant)
-        examiner = stack.enter_context(
-            contextlib.closing(Examiner(variant, options, eval_episodes))
-        )
         run = Run(out, learner, examiner, on_progress)
         stack.callback(run.close)
         run.train(limit, settings.collect_steps, eval_every, checkpoint_period_s)

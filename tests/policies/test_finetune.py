@@ -174,7 +174,8 @@ def test_a_run_is_evaluated_before_it_learns_and_counts_what_it_did(whole):
     assert outcome.env_steps == STEPS
     assert outcome.step == 2 * STEPS // 6
     stages = [report.stage for report in reports]
-    assert stages.index("looking") < stages.index("training eyes") < stages.index("evaluating")
+    order = ("evaluating", "looking", "training eyes", "training")
+    assert sorted(order, key=stages.index) == list(order)
     evaluations = json.loads((out / "training" / "evaluations.json").read_text())
     assert [row["env_steps"] for row in evaluations] == [0, STEPS]
     clips = sorted(path.name for path in (out / "training" / "clips").iterdir())
@@ -253,13 +254,30 @@ def test_success_has_fallen_where_chance_does_not_explain_it(rates, expected):
     assert fallen(evaluations) is expected
 
 
-def test_a_run_whose_success_falls_ends_and_keeps_what_it_had(base, tmp_path, monkeypatch):
-    rates = iter([0.9, 0.1])
+def pretend(monkeypatch, rates):
+    """Let evaluations have these success rates, one after the other."""
+    coming = iter(rates)
 
     def evaluate(self, policy, env_steps, updates, clip=None, on_episode=None):
-        return Evaluation(env_steps, updates, 100, 0.0, 1.0, next(rates), 0.0, 0.0, 0.0)
+        return Evaluation(env_steps, updates, 100, 0.0, 1.0, next(coming), 0.0, 0.0, 0.0)
 
     monkeypatch.setattr("hvs_suite.policies.rl.evaluation.Examiner.evaluate", evaluate)
+
+
+@pytest.mark.parametrize(("success", "keeps"), [(0.8, False), (0.9, True)])
+def test_eyes_with_which_fewer_scenes_are_solved_are_not_kept(
+    base, tmp_path, monkeypatch, success, keeps
+):
+    pretend(monkeypatch, [0.9, success, 0.9, 0.9])
+    finetune(base, "align-easy", tmp_path / "out", steps=6, **CALL)
+    before, after = (load_file(each / "model.safetensors") for each in (base, tmp_path / "out"))
+    changed = [name for name, value in before.items() if not torch.equal(value, after[name])]
+    assert bool(changed) is keeps
+
+
+def test_a_run_whose_success_falls_ends_and_keeps_what_it_had(base, tmp_path, monkeypatch):
+    # The base, with new eyes, where RL begins, and where it has led.
+    pretend(monkeypatch, [0.9, 0.9, 0.9, 0.1])
     call = {**CALL, "eval_every": 18}
     outcome = finetune(base, "align-easy", tmp_path / "out", steps=STEPS, **call)
     assert outcome.has_fallen
