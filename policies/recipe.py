@@ -1,7 +1,8 @@
 """How the shipped weights were made: for each named task, the commands that make them again.
 
-``recipes/<task>.json`` holds the training command of a policy, the dataset's recipe in the room of
-the datasets the recording command. Tasks that differ in tolerance alone share a policy.
+``recipes/<task>.json`` holds the training command of a policy and, where the suite ships a
+fine-tuned one, the command that makes it; the dataset's recipe in the room of the datasets has the
+recording command. Tasks that differ in tolerance alone share a policy.
 """
 
 import dataclasses
@@ -24,17 +25,19 @@ SHARED: Mapping[str, str] = MappingProxyType(
 
 @dataclasses.dataclass(frozen=True)
 class Recipe:
-    """Two commands.
+    """The commands, in order.
 
     Attributes:
         task: Named task whose policy this is.
         record: Words after ``hvs`` that record the demonstrations.
         pretrain: Words after ``hvs`` that train on them.
+        finetune: Words after ``hvs`` that fine-tune what came of it; None if that is not shipped.
     """
 
     task: str
     record: tuple[str, ...]
     pretrain: tuple[str, ...]
+    finetune: tuple[str, ...] | None
 
 
 def trained_on(task: str) -> str:
@@ -57,8 +60,18 @@ def recipe(task: str) -> Recipe:
     """
     registry.find(task)
     name = trained_on(task)
-    record, pretrain = (
-        tuple(shlex.split(json.loads((folder / f"{name}.json").read_text())["command"])[1:])
+    recorded, learned = (
+        json.loads((folder / f"{name}.json").read_text())
         for folder in (DATASET_RECIPES, HERE / "recipes")
     )
-    return Recipe(name, record, pretrain)
+    finetune = learned.get("finetune")
+    return Recipe(
+        name,
+        _words(recorded["command"]),
+        _words(learned["command"]),
+        None if finetune is None else _words(finetune),
+    )
+
+
+def _words(command: str) -> tuple[str, ...]:
+    return tuple(shlex.split(command)[1:])

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 
 from hvs_suite.cli import console
@@ -11,7 +12,7 @@ from hvs_suite.errors import OptionError
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Reproduce:
-    """Record, pretrain and evaluate as the shipped weights of a task were made.
+    """Record, pretrain, fine-tune and evaluate as the shipped weights of a task were made.
 
     Runs the commands of datasets/recipes and policies/recipes below the current folder, in runs/,
     and prints the hours of each stage. Interrupted, the same command goes on.
@@ -34,24 +35,36 @@ class Reproduce:
         if self.episodes is not None and self.episodes < 1:
             raise OptionError(f"--episodes must be at least 1, not {self.episodes}")
         plan = recipe(self.task)
-        result = Path("runs/results") / f"{self.task}.json"
         record = list(plan.record)
-        out = Path(record[record.index("--out") + 1])
-        if (out / "hvs.json").exists():
+        if (_out(record) / "hvs.json").exists():
             record.append("--resume")
-        policy = plan.pretrain[plan.pretrain.index("--out") + 1]
         episodes = self.episodes or EPISODES.get(self.task, TEST_SCENARIOS)
-        score = f"evaluate --policy {policy} --task {self.task} --episodes {episodes}"
+        stages = {"record": record}
+        results: dict[str, Path] = {}
+        for name, train in (("pretrained", plan.pretrain), ("fine-tuned", plan.finetune)):
+            if train is None:
+                continue
+            results[name] = Path("runs/results") / f"{_out(train).name}-on-{self.task}.json"
+            score = f"evaluate --task {self.task} --episodes {episodes} --workers 2"
+            files = ["--policy", str(_out(train)), "--out", str(results[name])]
+            stages[train[0]] = [*train]
+            stages[f"evaluate, {name}"] = [*score.split(), *files]
         times_s: dict[str, float] = {}
-        for words in (record, plan.pretrain, [*score.split(), "--workers", "2", "--out", result]):
-            line = shlex.join(["hvs", *map(str, words)])
-            with console.stage(line, times_s):
-                parse([*map(str, words)]).run()
-        summary = json.loads(result.read_text(encoding="utf-8"))["summary"]
-        low, high = summary["pc_success_ci95"]
-        console.print_times({line.split()[1]: taken for line, taken in times_s.items()})
-        print(
-            f"{self.task}: {summary['n_success']} of {summary['n_episodes']} solved, "
-            f"{summary['pc_success']:.1f} % (95 % interval {low:.1f} to {high:.1f} %), "
-            f"{summary['n_collision']} collisions"
-        )
+        lines = {stage: shlex.join(["hvs", *words]) for stage, words in stages.items()}
+        for stage, words in stages.items():
+            with console.stage(lines[stage], times_s):
+                parse(words).run()
+        console.print_times({stage: times_s[line] for stage, line in lines.items()})
+        for name, result in results.items():
+            summary = json.loads(result.read_text(encoding="utf-8"))["summary"]
+            low, high = summary["pc_success_ci95"]
+            print(
+                f"{self.task}, {name}: {summary['n_success']} of {summary['n_episodes']} solved, "
+                f"{summary['pc_success']:.1f} % (95 % interval {low:.1f} to {high:.1f} %), "
+                f"{summary['n_collision']} collisions"
+            )
+
+
+def _out(words: Sequence[str]) -> Path:
+    """The folder that a command writes."""
+    return Path(words[words.index("--out") + 1])

@@ -1,5 +1,7 @@
 """How shipped weights are made: every named task's commands are there, and ``hvs`` takes them."""
 
+from pathlib import Path
+
 import pytest
 
 import hvs_suite
@@ -14,6 +16,11 @@ def test_a_recipe_trains_on_what_it_records(task):
     assert record.task == plan.task == trained_on(task)
     assert pretrain.data == record.out
     assert pretrain.steps
+    if plan.finetune is not None:
+        finetune = parse(plan.finetune)
+        assert (Path(finetune.policy), finetune.task) == (pretrain.out, plan.task)
+        assert finetune.out != pretrain.out
+        assert finetune.steps
 
 
 @pytest.mark.parametrize("task", sorted(hvs_suite.TASKS))
