@@ -35,7 +35,7 @@ def draw_rl_run(training: Path, evaluations: Sequence[Evaluation]) -> Path:
     curves = read_curves(training / "tensorboard")
     figure = Figure(figsize=(11.0, 3.6), layout="constrained")
     success, playing, learning = figure.subplots(1, 3)
-    steps = [each.env_steps for each in evaluations]
+    steps = [each.env_steps / 1000.0 for each in evaluations]
     rates = [100.0 * each.success_rate for each in evaluations]
     ranges = [
         wilson_interval(round(each.success_rate * each.episodes), each.episodes)
@@ -50,17 +50,18 @@ def draw_rl_run(training: Path, evaluations: Sequence[Evaluation]) -> Path:
     success.set_title(f"evaluations, {evaluations[-1].episodes} episodes each")
     for name, label in ROLLOUT.items():
         if name in curves:
-            playing.plot(curves[name][0], 100.0 * curves[name][1], label=label, linewidth=1.2)
+            playing.plot(
+                curves[name][0] / 1000.0, 100.0 * curves[name][1], label=label, linewidth=1.2
+            )
     playing.set(ylim=(0.0, 102.0), ylabel="share of the last 100 episodes (%)")
     playing.set_title("while exploring")
     for name, label in LOSSES.items():
         if name in curves:
-            learning.plot(*curves[name], label=label, linewidth=1.2)
+            learning.plot(curves[name][0] / 1000.0, curves[name][1], label=label, linewidth=1.2)
     learning.set_title("learning")
     for axes in (success, playing, learning):
-        axes.set_xlabel("environment steps")
+        axes.set_xlabel("environment steps (thousands)")
         axes.grid(alpha=0.3)
-        axes.ticklabel_format(axis="x", style="sci", scilimits=(0, 4))
     for axes in (playing, learning):
         if axes.lines:
             axes.legend(frameon=False, fontsize=8)
