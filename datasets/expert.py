@@ -242,11 +242,17 @@ class Expert:
         if len(family) == 0:
             return q  # Out of reach: stand still.
         required = min(CLEARANCE_M, self._clearance_m - 1e-3)
-        candidates = _soonest_first(q, velocity, family)
+        candidates = self._in_order(q, velocity, family)
         motion = self._first_clear(q, velocity, candidates, required)
         if motion is None:
             motion = self._escape(q, velocity, position, normal, required)
         return self._point_ahead(motion)
+
+    def _in_order(
+        self, q: FloatArray, velocity: FloatArray, family: FloatArray
+    ) -> collections.abc.Iterator[FloatArray]:
+        """Goal configurations (7,) of a family (m, 7), the one to take first."""
+        return _soonest_first(q, velocity, family)
 
     def _point_ahead(self, motion: ruckig.Trajectory) -> FloatArray:
         """Where a motion is at the end of the control step (7,); the arm trails its set point."""

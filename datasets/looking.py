@@ -11,19 +11,21 @@ the hand to see it. So until the eye in the hand has seen the target, the demons
 place above it, from which it will.
 
 And where the arm may start anywhere, it goes there in one of two postures, the elbow straight above
-the line from shoulder to wrist, A1 towards the target or away from it. The expert chooses the
-soonest of some two thousand, and which that is jumps with every little change of where the arm
-stands: nobody could learn it (docs/experiments/simple-ways.md). Two postures cost three steps.
+the line from shoulder to wrist, A1 towards the target or away from it: the one whose slowest joint
+arrives first at full speed. The expert chooses the soonest of some two thousand, and which that is
+jumps with every little change of where the arm stands: nobody could learn it
+(docs/experiments/simple-ways.md). Two postures cost three steps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
+from hvs_suite.cell.robot import JOINT_SPEED_RAD_S
 from hvs_suite.datasets.expert import CLEARANCE_M, Expert
 from hvs_suite.tasks.variants import TASKS
 
@@ -51,7 +53,8 @@ class Demonstrator(Expert):
         variant = env.variant
         named = TASKS.get(variant.name)
         starts = {variant.start, named.start if named is not None else variant.start}
-        if "random" in starts:
+        self._is_plain = "random" in starts
+        if self._is_plain:
             self.n_swivel = PLAIN_SWIVELS
         self._looks_down = variant.eth_position_noise_m > 0 or variant.eth_rotation_noise_deg > 0
         self.reset()
@@ -78,6 +81,20 @@ class Demonstrator(Expert):
             raised = truth["goal_position"] + LOOK_DOWN_M * truth["goal_normal"]
             return {**truth, "goal_position": raised}
         return truth
+
+    def _in_order(
+        self, q: FloatArray, velocity: FloatArray, family: FloatArray
+    ) -> Iterator[FloatArray]:
+        if not self._is_plain:
+            return super()._in_order(q, velocity, family)
+        times = (np.abs(family - q) / JOINT_SPEED_RAD_S)[:, :6].max(axis=1)
+        return iter(family[np.argsort(times, kind="stable")])
+
+    def _nearest_goal(
+        self, rest: FloatArray, position: FloatArray, normal: FloatArray
+    ) -> FloatArray | None:
+        # Beside the two, it would be another goal for every place that the arm comes from.
+        return None if self._is_plain else super()._nearest_goal(rest, position, normal)
 
     def _next_set_point(
         self, q: FloatArray, velocity: FloatArray, position: FloatArray, normal: FloatArray

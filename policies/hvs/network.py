@@ -20,6 +20,7 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
+from hvs_suite.datasets.looking import LOOK_DOWN_M
 from hvs_suite.policies.hvs import geometry
 from hvs_suite.policies.hvs.geometry import Calibration
 
@@ -47,9 +48,12 @@ SEEN_LOGIT = 2.0
 NEVER_LOGIT = -20.0
 """What cannot be in view at all: its weight is below a float's precision beside any other."""
 ESTIMATE_FEATURES = 7
-N_POSTURES = 2
-"""Of `geometry.postures`."""
-POSTURE_FEATURES = 8
+WAY_FEATURES = 2 * (N_JOINTS - 1) + 2
+"""Turns of A1 to A6 that are left, the step there, its time, and whether the ranges allow it."""
+UNREACHABLE_S = 100.0
+"""Added to the time of a way that leads out of the joint ranges."""
+CONTROL_PERIOD_S = 0.1
+"""Of all named tasks."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -306,8 +310,9 @@ class HvsNetwork(nn.Module):
             # What each camera sees, what it saw, and what is made of all that.
             n_estimates = 2 * n_cameras + 1
             width += 3 * N_JOINTS + 12 + ESTIMATE_FEATURES * n_estimates + N_JOINTS
-            width += N_POSTURES * POSTURE_FEATURES
-            width += "eih" in shape.cameras
+            width += WAY_FEATURES
+            if "eih" in shape.cameras:
+                width += 1 + WAY_FEATURES + 1
             if shape.state_dim == POSITIONS_AND_VELOCITIES:
                 width += N_JOINTS
         hidden = shape.hidden
@@ -328,6 +333,9 @@ class HvsNetwork(nn.Module):
         # what they see.
         self.memory_trust = nn.Parameter(torch.zeros(n_cameras))
         self.step_gain = nn.Parameter(torch.full((N_JOINTS,), 0.5))
+        self.stride_gain = nn.Parameter(torch.full((N_JOINTS,), 0.5))
+        # How much higher to aim until the eye in the hand has seen the target.
+        self.above_gain = nn.Parameter(torch.zeros(1))
         self.n_features = width + N_JOINTS
         self.residual = (
             make_residual(self.n_features, shape.residual_hidden) if shape.residual_hidden else None
@@ -414,7 +422,15 @@ class HvsNetwork(nn.Module):
         step = torch.asinh(geometry.joint_step(motion, target + lift - motion.position) / scale)
         features += [torch.sin(q), torch.cos(q), q / self.joint_range]
         features += [motion.position, motion.rotation.flatten(1), step]
-        features += self._ways(q, geometry.postures(target + lift))
+        way, stride = self._way(q, geometry.postures(target + lift))
+        features += [way, stride[:, :-1]]
+        if "eih" in sightings:
+            # Where a demonstrator heads for until the eye in the hand has seen the target.
+            above = lift + lift.new_tensor([0.0, 0.0, LOOK_DOWN_M])
+            way, higher = self._way(q, geometry.postures(target + above))
+            unseen = 1.0 - remembered[:, MEMORY_SIZE - 1 : MEMORY_SIZE]
+            features += [way, higher[:, :-1], unseen]
+            stride = stride + self.above_gain * unseen * (higher - stride)
         if "eih" in sightings:
             # Where the joints lie about the height, the disc's size tells the truth.
             diameter = torch.exp(sightings["eih"].log_diameter.clamp(-5.0, 2.0))
@@ -426,27 +442,34 @@ class HvsNetwork(nn.Module):
             offset = estimate[:, :3] + lift - motion.position
             in_flange = (offset[:, None] @ motion.rotation)[:, 0]
             features += [offset, torch.asinh(in_flange / scale), estimate[:, 3:]]
-        out, known = self._say(features, self.step_gain * step)
+        out, known = self._say(features, self.step_gain * step + self.stride_gain * stride)
         return Decision(out, known, sightings, target, remembered, motion)
 
-    def _ways(self, q: Tensor, goals: Tensor) -> list[Tensor]:
-        """What the head reads of the ways to the plain postures, (B, 8) each.
+    def _way(self, q: Tensor, goals: Tensor) -> tuple[Tensor, Tensor]:
+        """The way to the nearer of the plain postures that lie within the joint ranges.
 
-        The turns of A1 to A6 that are left, on the logarithmic scale, the time of the slowest at
-        full speed (s), and whether the posture lies within the joint ranges.
+        Nearer is where the slowest joint arrives first at full speed, as a demonstrator reckons.
 
         Args:
             q: Measured joint positions, (B, 7) rad.
             goals: Angles of A1 to A6, (B, 2, 6) rad.
+
+        Returns:
+            What is left of the turns of A1 to A6, its time (s) and whether any posture lies
+            within the ranges, (B, 8); and the joint step that goes there, all joints arriving
+            together, (B, 7), A7 at rest; turns and step on the logarithmic scale.
         """
-        found = []
-        for goal in goals.unbind(dim=1):
-            way = goal - q[:, :-1]
-            time = (way.abs() / self.joint_speed[:-1]).amax(dim=1, keepdim=True)
-            reachable = (goal.abs() <= self.joint_range[:-1]).all(dim=1, keepdim=True)
-            scaled = torch.asinh(way / self.shape.error_scale)
-            found.append(torch.cat([scaled, time, reachable.to(q.dtype)], dim=1))
-        return found
+        ways = goals - q[:, None, :-1]
+        times = (ways.abs() / self.joint_speed[:-1]).amax(dim=2)
+        reachable = (goals.abs() <= self.joint_range[:-1]).all(dim=2)
+        nearer = torch.where(reachable, times, times + UNREACHABLE_S).argmin(dim=1)
+        row = torch.arange(len(q), device=q.device)
+        way, time = ways[row, nearer], times[row, nearer, None]
+        step = way * (CONTROL_PERIOD_S / time.clamp(min=CONTROL_PERIOD_S))
+        scaled = torch.asinh(way / self.shape.error_scale)
+        within = reachable.any(dim=1, keepdim=True).to(q.dtype)
+        step = torch.asinh(step / self.shape.error_scale)
+        return torch.cat([scaled, time, within], dim=1), nn.functional.pad(step, (0, 1))
 
     def _say(self, features: list[Tensor], step: Tensor | float) -> tuple[Tensor, Tensor]:
         """The output, and the features that a residual reads."""
