@@ -18,6 +18,8 @@ from hvs_suite.cell.robot import (
     FLANGE_HEIGHT_M,
     JOINT_AXES,
     JOINT_HEIGHTS_M,
+    JOINT_RANGE_RAD,
+    JOINT_SPEED_RAD_S,
     SHOULDER_TO_ELBOW_M,
     WRIST_TO_FLANGE_M,
 )
@@ -30,6 +32,8 @@ DAMPING_M = 0.03
 # Offsets are shortened to this before the inverse, which only holds near the goal.
 LINEARISATION_RANGE_M = 0.10
 LINEARISATION_RANGE_RAD = 0.30
+# Added to the time of a way that leads out of the joint ranges.
+UNREACHABLE_S = 100.0
 # Least number of frames that show the target before a camera is calibrated from data.
 MIN_CALIBRATION_FRAMES = 60
 
@@ -158,6 +162,30 @@ def postures(goal: Tensor) -> Tensor:
         one = torch.cat([towards[:, None], plane], dim=1)
         other = torch.cat([away[:, None], -plane], dim=1)
         return torch.stack([one, other], dim=1)
+
+
+def way_to_posture(q: Tensor, goal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The way to the nearer of the two plain postures that lie within the joint ranges.
+
+    Nearer is where the slowest joint arrives first at full speed, as a demonstrator reckons.
+
+    Args:
+        q: Joint angles, (B, 7) rad.
+        goal: Of the flange, (B, 3) m. No gradient flows through it.
+
+    Returns:
+        The turns of A1 to A6 that are left, (B, 6) rad, the time of the slowest, (B, 1) s, and 1 if
+        that posture lies within the ranges, else 0, (B, 1).
+    """
+    speed = torch.as_tensor(JOINT_SPEED_RAD_S[:-1]).to(q)
+    limit = torch.as_tensor(JOINT_RANGE_RAD[:-1]).to(q)
+    ends = postures(goal)
+    ways = ends - q[:, None, :-1]
+    times = (ways.abs() / speed).amax(dim=2)
+    within = (ends.abs() <= limit).all(dim=2)
+    nearer = torch.where(within, times, times + UNREACHABLE_S).argmin(dim=1)
+    row = torch.arange(len(q), device=q.device)
+    return ways[row, nearer], times[row, nearer, None], within[row, nearer, None].to(q)
 
 
 def seen_from_hand(

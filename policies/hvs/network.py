@@ -49,9 +49,7 @@ NEVER_LOGIT = -20.0
 """What cannot be in view at all: its weight is below a float's precision beside any other."""
 ESTIMATE_FEATURES = 7
 WAY_FEATURES = 2 * (N_JOINTS - 1) + 2
-"""Turns of A1 to A6 that are left, the step there, its time, and whether the ranges allow it."""
-UNREACHABLE_S = 100.0
-"""Added to the time of a way that leads out of the joint ranges."""
+"""Of `HvsNetwork._way`."""
 CONTROL_PERIOD_S = 0.1
 """Of all named tasks."""
 
@@ -422,14 +420,14 @@ class HvsNetwork(nn.Module):
         step = torch.asinh(geometry.joint_step(motion, target + lift - motion.position) / scale)
         features += [torch.sin(q), torch.cos(q), q / self.joint_range]
         features += [motion.position, motion.rotation.flatten(1), step]
-        way, stride = self._way(q, geometry.postures(target + lift))
-        features += [way, stride[:, :-1]]
+        way, stride = self._way(q, target + lift)
+        features.append(way)
         if "eih" in sightings:
             # Where a demonstrator heads for until the eye in the hand has seen the target.
             above = lift + lift.new_tensor([0.0, 0.0, LOOK_DOWN_M])
-            way, higher = self._way(q, geometry.postures(target + above))
+            way, higher = self._way(q, target + above)
             unseen = 1.0 - remembered[:, MEMORY_SIZE - 1 : MEMORY_SIZE]
-            features += [way, higher[:, :-1], unseen]
+            features += [way, unseen]
             stride = stride + self.above_gain * unseen * (higher - stride)
         if "eih" in sightings:
             # Where the joints lie about the height, the disc's size tells the truth.
@@ -445,31 +443,22 @@ class HvsNetwork(nn.Module):
         out, known = self._say(features, self.step_gain * step + self.stride_gain * stride)
         return Decision(out, known, sightings, target, remembered, motion)
 
-    def _way(self, q: Tensor, goals: Tensor) -> tuple[Tensor, Tensor]:
-        """The way to the nearer of the plain postures that lie within the joint ranges.
-
-        Nearer is where the slowest joint arrives first at full speed, as a demonstrator reckons.
+    def _way(self, q: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
+        """What the head reads of the way to a plain posture over a goal, and a step that way.
 
         Args:
             q: Measured joint positions, (B, 7) rad.
-            goals: Angles of A1 to A6, (B, 2, 6) rad.
+            goal: Of the flange, (B, 3) m.
 
         Returns:
-            What is left of the turns of A1 to A6, its time (s) and whether any posture lies
-            within the ranges, (B, 8); and the joint step that goes there, all joints arriving
-            together, (B, 7), A7 at rest; turns and step on the logarithmic scale.
+            (B, 14): what is left of the turns of A1 to A6, its time (s), 1 if the posture lies
+            within the joint ranges, else 0, and the joint step that goes there; and that step
+            alone, (B, 7), A7 at rest. Turns and steps are on the logarithmic scale.
         """
-        ways = goals - q[:, None, :-1]
-        times = (ways.abs() / self.joint_speed[:-1]).amax(dim=2)
-        reachable = (goals.abs() <= self.joint_range[:-1]).all(dim=2)
-        nearer = torch.where(reachable, times, times + UNREACHABLE_S).argmin(dim=1)
-        row = torch.arange(len(q), device=q.device)
-        way, time = ways[row, nearer], times[row, nearer, None]
-        step = way * (CONTROL_PERIOD_S / time.clamp(min=CONTROL_PERIOD_S))
-        scaled = torch.asinh(way / self.shape.error_scale)
-        within = reachable.any(dim=1, keepdim=True).to(q.dtype)
-        step = torch.asinh(step / self.shape.error_scale)
-        return torch.cat([scaled, time, within], dim=1), nn.functional.pad(step, (0, 1))
+        turns, time_s, within = geometry.way_to_posture(q, goal)
+        step = turns * (CONTROL_PERIOD_S / time_s.clamp(min=CONTROL_PERIOD_S))
+        turns, step = (torch.asinh(each / self.shape.error_scale) for each in (turns, step))
+        return torch.cat([turns, time_s, within, step], dim=1), F.pad(step, (0, 1))
 
     def _say(self, features: list[Tensor], step: Tensor | float) -> tuple[Tensor, Tensor]:
         """The output, and the features that a residual reads."""

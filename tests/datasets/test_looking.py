@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+import torch
 
 import hvs_suite
 from hvs_suite.cell.kinematics import kinematics
+from hvs_suite.cell.robot import JOINT_SPEED_RAD_S
 from hvs_suite.datasets.expert import Expert
 from hvs_suite.datasets.looking import Demonstrator
 
@@ -79,3 +81,25 @@ def test_where_the_far_camera_may_be_off_the_hand_looks_before_it_comes_down(tas
     # Now and then the arm starts lower than that.
     assert np.mean(np.array(heights_m) > 0.1) > 0.85
     assert len(heights_m) == 30
+
+
+@pytest.mark.parametrize("task", ["align-hard", "align-limit"])
+def test_from_a_random_start_the_way_is_the_one_that_the_policy_takes_to_be_the_nearer(task):
+    from hvs_suite.policies.hvs.geometry import way_to_posture
+
+    both = 0
+    with hvs_suite.load(task, split="train", observations="state") as env:
+        demonstrator = Demonstrator(env)
+        for scenario in range(40):
+            env.reset(scenario=scenario)
+            truth = env.privileged()
+            q, goal = truth["joint_positions"], truth["goal_position"]
+            turns, time_s, within = way_to_posture(torch.tensor(q[None]), torch.tensor(goal[None]))
+            demonstrator._remember_goal(goal, truth["goal_normal"])
+            family = demonstrator._reachable(q, np.zeros(7), goal, truth["goal_normal"])
+            both += len(family) == 2
+            first = next(iter(demonstrator._in_order(q, np.zeros(7), family)))
+            np.testing.assert_allclose(first[:6], q[:6] + turns[0].numpy(), atol=1e-6)
+            slowest = np.abs(turns[0].numpy() / JOINT_SPEED_RAD_S[:6]).max()
+            assert (time_s.item(), within.item()) == (pytest.approx(slowest), 1.0)
+    assert both > 20
