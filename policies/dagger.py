@@ -23,6 +23,7 @@ from hvs_suite.datasets.recorder import in_order
 from hvs_suite.errors import OutputError
 from hvs_suite.policies.checkpoint import CheckpointFactory
 from hvs_suite.policies.demonstrations import Manifest, Recording
+from hvs_suite.policies.frame_cache import open_frames
 from hvs_suite.policies.hvs.network import IMAGE_PREFIX
 from hvs_suite.rollout import Policy, play
 
@@ -212,10 +213,7 @@ def read_round(folder: Path) -> tuple[RoundSummary, Recording] | None:
     summary = RoundSummary(**json.loads((folder / SUMMARY).read_text()))
     with np.load(folder / COLUMNS, allow_pickle=False) as file:
         columns = dict(file)
-    images = {
-        path.stem: np.load(path, mmap_mode="r", allow_pickle=False)
-        for path in sorted(folder.glob(f"{IMAGE_PREFIX}*.npy"))
-    }
+    images = {path.stem: open_frames(path) for path in sorted(folder.glob(f"{IMAGE_PREFIX}*.npy"))}
     return summary, Recording(columns, images)
 
 

@@ -18,7 +18,13 @@ from torch import Tensor
 
 from hvs_suite.datasets.metadata import read_metadata
 from hvs_suite.errors import DatasetError, OptionError
-from hvs_suite.policies.frame_cache import Frames, OnFrames, cached_frames, data_files
+from hvs_suite.policies.frame_cache import (
+    Frames,
+    OnFrames,
+    cached_frames,
+    data_files,
+    read_rows,
+)
 from hvs_suite.policies.hvs.geometry import (
     Calibration,
     calibrate,
@@ -238,9 +244,7 @@ class FramePool:
             begin = 0
             for recording, rows in parts:
                 end = begin + len(rows)
-                # Clipping copies straight into place, where checking would take a buffer.
-                place = images[begin:end].numpy()
-                np.take(recording.images[key], rows, axis=0, out=place, mode="clip")
+                read_rows(recording.images[key], rows, images[begin:end].numpy())
                 begin = end
             # (B, H, W, C) stays the layout in memory, which is what the convolutions want.
             batch[key] = images.permute(0, 3, 1, 2)

@@ -7,6 +7,7 @@ keeps in memory what training reads. Decoding a PNG costs ten times what reading
 import contextlib
 import hashlib
 import json
+import mmap
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -82,7 +83,7 @@ def cached_frames(
     # A half-written cache has no stamp, because the stamp is written last.
     with contextlib.suppress(OSError, ValueError):
         if json.loads(made_from.read_text()) == stamp:
-            return _open(path)
+            return open_frames(path)
     made_from.unlink(missing_ok=True)
     open_memmap: Any = np.lib.format.open_memmap  # untyped in NumPy's stubs
     frames = open_memmap(path, mode="w+", dtype=np.uint8, shape=(n_frames, *shape))
@@ -102,11 +103,52 @@ def cached_frames(
         temporary.write_text(json.dumps(stamp))
     if on_frames is not None and done % ROWS_AT_ONCE:
         on_frames(done % ROWS_AT_ONCE)
-    return _open(path)
+    return open_frames(path)
 
 
-def _open(path: Path) -> Frames:
-    return np.load(path, mmap_mode="r", allow_pickle=False)
+def open_frames(path: Path) -> Frames:
+    """Memory-map an array file of frames for `read_rows`, read-only.
+
+    Args:
+        path: The file, as NumPy writes it.
+
+    Returns:
+        (n, H, W, C) uint8.
+    """
+    frames: Frames = np.load(path, mmap_mode="r", allow_pickle=False)
+    mapping = _mapping(frames)
+    if mapping is not None:
+        # Rows are drawn at random. Where disks read some megabytes ahead, for each of them, the
+        # frames of a batch would push those of the next out of memory.
+        mapping.madvise(mmap.MADV_RANDOM)
+    return frames
+
+
+def _mapping(frames: Frames) -> mmap.mmap | None:
+    """The mapping behind an array, where the system can be told how it will be read."""
+    advisable = isinstance(frames, np.memmap) and hasattr(mmap, "MADV_WILLNEED")
+    return frames.base if advisable and isinstance(frames.base, mmap.mmap) else None
+
+
+def read_rows(frames: Frames, rows: npt.NDArray[np.int64], out: Frames) -> None:
+    """Copy some frames.
+
+    Args:
+        frames: As `open_frames` opens them, or any array, (n, H, W, C).
+        rows: Which, (m,), in ascending order.
+        out: Gets them, (m, H, W, C).
+    """
+    mapping = _mapping(frames)
+    if mapping is not None:
+        # The array ends where its file does, and begins after NumPy's header.
+        begin = len(mapping) - frames.nbytes
+        for row in rows.tolist():
+            start = begin + row * frames.strides[0]
+            page = start - start % mmap.PAGESIZE
+            # All of them are on their way before the first is waited for.
+            mapping.madvise(mmap.MADV_WILLNEED, page, start + frames.strides[0] - page)
+    # Clipping copies straight into place, where checking would take a buffer.
+    np.take(frames, rows, axis=0, out=out, mode="clip")
 
 
 def _encoded(root: Path, key: str) -> Iterator[bytes]:
