@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from hvs_suite.errors import PolicyError, UnknownTaskError
+from hvs_suite.policies import catalogue
 from hvs_suite.policies.catalogue import policy_factory
 from hvs_suite.policies.checkpoint import CheckpointPolicy
 from hvs_suite.tasks.variants import TASKS
@@ -72,7 +73,9 @@ def test_a_checkpoint_travels_to_workers_and_plays(checkpoint, named):
 
 
 @pytest.mark.parametrize("spec", ["pretrained", "finetuned", "exprt", "no/such/folder"])
-def test_what_does_not_exist_says_so_in_one_line(spec):
+def test_what_does_not_exist_says_so_in_one_line(spec, tmp_path, monkeypatch):
+    # A folder of policies without any weights: the suite's own grows.
+    monkeypatch.setattr(catalogue, "HERE", tmp_path)
     with pytest.raises(PolicyError) as error:
         policy_factory(spec, "align-limit")
     assert "\n" not in str(error.value)
