@@ -34,6 +34,12 @@ LINEARISATION_RANGE_M = 0.10
 LINEARISATION_RANGE_RAD = 0.30
 # Added to the time of a way that leads out of the joint ranges.
 UNREACHABLE_S = 100.0
+# How far below the lowest goal the flange may be sent (m): more than anyone overshoots who is at
+# rest soon, and less than the height over the surface at which goals lie.
+LEAST_HEIGHT_MARGIN_M = 0.01
+# Rounds of Gauss-Newton that lift the flange, and their damping.
+LIFTS = 4
+LIFT_DAMPING_M = 0.05
 # Least number of frames that show the target before a camera is calibrated from data.
 MIN_CALIBRATION_FRAMES = 60
 
@@ -188,6 +194,31 @@ def way_to_posture(q: Tensor, goal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return ways[row, nearer], times[row, nearer, None], within[row, nearer, None].to(q)
 
 
+def lifted(q: Tensor, least_height_m: Tensor) -> Tensor:
+    """The joint angles nearest to given ones at which the flange is not too low.
+
+    Gauss-Newton on the height of the flange, damped as `joint_step` is; angles that are high enough
+    are left alone.
+
+    Args:
+        q: Joint angles, (B, 7) rad.
+        least_height_m: Least height of the flange, scalar (m).
+
+    Returns:
+        Joint angles, (B, 7) rad.
+    """
+    motion = flange_motion(q)
+    too_low = motion.position[:, 2:] < least_height_m
+    if not too_low.any():
+        return q
+    for _ in range(LIFTS):
+        rise = motion.jacobian[:, 2]
+        gain = (rise**2).sum(dim=1, keepdim=True) + LIFT_DAMPING_M**2
+        q = q + too_low * rise * ((least_height_m - motion.position[:, 2:]) / gain)
+        motion = flange_motion(q)
+    return q
+
+
 def seen_from_hand(
     motion: FlangeMotion, uv: Tensor, rays: Tensor, plane_height_m: Tensor
 ) -> Tensor:
@@ -248,6 +279,7 @@ class Calibration:
         standoff_m: Distance between flange face and target at the goal (m).
         size_at_1m: Apparent diameter of the target in the eye in hand (image widths) times its
             depth (m); 0 if it was never seen.
+        lowest_goal_m: Height of the lowest goal of the flange (m).
     """
 
     rays: FloatArray
@@ -255,6 +287,7 @@ class Calibration:
     plane_height_m: float
     standoff_m: float
     size_at_1m: float
+    lowest_goal_m: float
 
 
 def calibrate(
@@ -293,7 +326,8 @@ def calibrate(
         homography = _direct_linear(
             target_eth[seen, :2], np.concatenate([target[seen, :2], ones], axis=1)
         )
-    return Calibration(rays, homography, float(target[:, 2].mean()), standoff_m, size_at_1m)
+    height, lowest = float(target[:, 2].mean()), float(goal_position[:, 2].min())
+    return Calibration(rays, homography, height, standoff_m, size_at_1m, lowest)
 
 
 def _seen(target: FloatArray) -> npt.NDArray[np.bool_]:

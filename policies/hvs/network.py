@@ -286,6 +286,7 @@ class HvsNetwork(nn.Module):
     plane_height: Tensor
     standoff: Tensor
     size_at_1m: Tensor
+    lowest_goal: Tensor
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
@@ -302,6 +303,8 @@ class HvsNetwork(nn.Module):
         self.register_buffer("plane_height", torch.tensor(0.0))
         self.register_buffer("standoff", torch.tensor(0.05))
         self.register_buffer("size_at_1m", torch.tensor(0.0))
+        # Until it is known, nothing is too low.
+        self.register_buffer("lowest_goal", torch.tensor(-math.inf))
         n_cameras = len(shape.cameras)
         width = SIGHTING_FEATURES * n_cameras
         if shape.state_dim:
@@ -346,6 +349,7 @@ class HvsNetwork(nn.Module):
         self.plane_height.fill_(calibration.plane_height_m)
         self.standoff.fill_(calibration.standoff_m)
         self.size_at_1m.fill_(calibration.size_at_1m)
+        self.lowest_goal.fill_(calibration.lowest_goal_m)
 
     @property
     def calibration(self) -> Calibration:
@@ -357,6 +361,7 @@ class HvsNetwork(nn.Module):
             self.plane_height.item(),
             self.standoff.item(),
             self.size_at_1m.item(),
+            self.lowest_goal.item(),
         )
 
     def look(self, images: Mapping[str, Tensor]) -> dict[str, Sighting]:
@@ -512,7 +517,9 @@ class HvsNetwork(nn.Module):
         return best, estimates, torch.cat(held, dim=1).detach()
 
     def to_action(self, out: Tensor, state: Tensor | None) -> Tensor:
-        """Decode the head's output.
+        """Decode the head's output, and keep the flange from going below where goals lie.
+
+        Who comes down fast, one joint against another, is easily some centimetres too low.
 
         Args:
             out: (B, 7).
@@ -524,6 +531,7 @@ class HvsNetwork(nn.Module):
         if state is None:
             return out.clamp(-1.0, 1.0)
         target = state[:, :N_JOINTS] + self.to_step(out)
+        target = geometry.lifted(target, self.lowest_goal - geometry.LEAST_HEIGHT_MARGIN_M)
         return (target / self.joint_range).clamp(-1.0, 1.0)
 
     def to_step(self, out: Tensor) -> Tensor:

@@ -108,6 +108,7 @@ def test_calibration_finds_the_cameras_that_made_the_data():
     np.testing.assert_allclose(found.homography, homography, atol=1e-6)
     assert found.plane_height_m == pytest.approx(0.0)
     assert found.size_at_1m == pytest.approx(0.04)
+    assert found.lowest_goal_m == pytest.approx(0.05)
 
 
 def test_going_astray_costs_more_the_nearer_the_goal_and_nothing_where_the_arm_only_swivels():
@@ -158,6 +159,28 @@ def test_the_label_is_what_the_action_decodes_to():
     action = reachable / torch.tensor(JOINT_RANGE_RAD, dtype=torch.float32)
     decoded = net.to_action(net.encode_label(action, state), state)
     torch.testing.assert_close(decoded, action, atol=1e-6, rtol=0.0)
+
+
+def test_no_action_sends_the_flange_below_where_goals_lie():
+    net = network()
+    net.lowest_goal.fill_(0.05)
+    joint_range = torch.tensor(JOINT_RANGE_RAD, dtype=torch.float32)
+    # Elbow bent, the other way round, stretched, and one that stays high enough.
+    q = torch.tensor(
+        [
+            [0.3, 1.2, 0.0, -1.2, 0.0, 0.8, 0.0],
+            [-0.8, -1.4, 0.0, 0.8, 0.0, -1.0, 1.0],
+            [0.3, 1.5, 0.0, -0.5, 0.0, 1.1, 0.0],
+            [0.3, 0.8, 0.0, -1.5, 0.0, 0.8, 0.0],
+        ]
+    )
+    step = 0.25 * torch.tensor([[1.0], [-1.0], [1.0], [1.0]]) * torch.eye(7)[1]
+    state = torch.cat([q, torch.zeros_like(q)], dim=1)
+    said = net.encode_label((q + step) / joint_range, state)
+    heights = geometry.flange_motion(net.to_action(said, state) * joint_range).position[:, 2]
+    assert (geometry.flange_motion(q + step).position[:3, 2] < 0.0).all()
+    assert heights[:3].tolist() == pytest.approx([0.04] * 3, abs=2e-3)
+    assert heights[3].item() == pytest.approx(0.084, abs=1e-3)
 
 
 def test_a_few_images_are_learned_by_heart():

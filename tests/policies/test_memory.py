@@ -81,7 +81,7 @@ def test_training_remembers_what_each_camera_saw_earlier_in_the_same_episode_alo
     }
     # The eye to hand maps its image onto a square metre around x = 0.4.
     homography = np.array([[0.5, 0.0, 0.4], [0.0, 0.5, 0.0], [0.0, 0.0, 1.0]])
-    calibration = Calibration(np.eye(3), homography, 0.02, 0.05, 0.1)
+    calibration = Calibration(np.eye(3), homography, 0.02, 0.05, 0.1, 0.07)
     memory = remembered_targets(columns, ["eih", "eth"], calibration, np.random.default_rng(0))
     assert memory.shape == (n, 8)
     assert not memory[:, :4].any()
