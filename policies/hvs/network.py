@@ -20,7 +20,8 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
-from hvs_suite.datasets.looking import LOOK_DOWN_M
+from hvs_suite.datasets.expert import LEAD_S
+from hvs_suite.datasets.looking import LEAST_HEIGHT_MARGIN_M, LOOK_DOWN_M, LOOK_OUT_RAD
 from hvs_suite.policies.hvs import geometry
 from hvs_suite.policies.hvs.geometry import Calibration
 
@@ -412,7 +413,8 @@ class HvsNetwork(nn.Module):
         """
         features = [s.features() for s in sightings.values()]
         if state is None:
-            out, known = self._say(features, 0.0)
+            inputs = torch.cat(features, dim=1)
+            out, known = self._with_residual(inputs, self.head(inputs))
             return Decision(out, known, sightings, None, None, None)
         q = state[:, :N_JOINTS]
         if memory is None:
@@ -425,15 +427,17 @@ class HvsNetwork(nn.Module):
         step = torch.asinh(geometry.joint_step(motion, target + lift - motion.position) / scale)
         features += [torch.sin(q), torch.cos(q), q / self.joint_range]
         features += [motion.position, motion.rotation.flatten(1), step]
-        way, stride = self._way(q, target + lift)
-        features.append(way)
+        goals = [target + lift]
         if "eih" in sightings:
             # Where a demonstrator heads for until the eye in the hand has seen the target.
-            above = lift + lift.new_tensor([0.0, 0.0, LOOK_DOWN_M])
-            way, higher = self._way(q, target + above)
+            goals.append(goals[0] + lift.new_tensor([0.0, 0.0, LOOK_DOWN_M]))
+        ways, strides = self._ways(q, goals)
+        features += ways
+        stride = strides[0]
+        if "eih" in sightings:
             unseen = 1.0 - remembered[:, MEMORY_SIZE - 1 : MEMORY_SIZE]
-            features += [way, unseen]
-            stride = stride + self.above_gain * unseen * (higher - stride)
+            features.append(unseen)
+            stride = stride + self.above_gain * unseen * (strides[1] - stride)
         if "eih" in sightings:
             # Where the joints lie about the height, the disc's size tells the truth.
             diameter = torch.exp(sightings["eih"].log_diameter.clamp(-5.0, 2.0))
@@ -445,30 +449,54 @@ class HvsNetwork(nn.Module):
             offset = estimate[:, :3] + lift - motion.position
             in_flange = (offset[:, None] @ motion.rotation)[:, 0]
             features += [offset, torch.asinh(in_flange / scale), estimate[:, 3:]]
-        out, known = self._say(features, self.step_gain * step + self.stride_gain * stride)
+        inputs = torch.cat(features, dim=1)
+        out = self.head(inputs) + self.step_gain * step + self.stride_gain * stride
+        if not self.training:
+            # As long as no camera has seen the target, the head can know no way there. What it
+            # learns in training must not wait for eyes that see.
+            has_seen = remembered[:, MEMORY_SIZE - 1 :: MEMORY_SIZE].amax(dim=1, keepdim=True)
+            out = torch.where(has_seen > 0, out, self._look_out(q))
+        out, known = self._with_residual(inputs, out)
         return Decision(out, known, sightings, target, remembered, motion)
 
-    def _way(self, q: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-        """What the head reads of the way to a plain posture over a goal, and a step that way.
+    def _ways(self, q: Tensor, goals: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+        """What the head reads of the ways to plain postures over some goals.
 
         Args:
             q: Measured joint positions, (B, 7) rad.
-            goal: Of the flange, (B, 3) m.
+            goals: Of the flange, (B, 3) m each.
 
         Returns:
-            (B, 14): what is left of the turns of A1 to A6, its time (s), 1 if the posture lies
-            within the joint ranges, else 0, and the joint step that goes there; and that step
-            alone, (B, 7), A7 at rest. Turns and steps are on the logarithmic scale.
+            For each goal, (B, 14): what is left of the turns of A1 to A6, its time (s), 1 if the
+            posture lies within the joint ranges, else 0, and the joint step that goes there; and
+            for each that step alone, (B, 7), A7 at rest. Turns and steps are on the logarithmic
+            scale.
         """
-        turns, time_s, within = geometry.way_to_posture(q, goal)
+        n = len(goals)
+        turns, time_s, within = geometry.way_to_posture(
+            q.repeat(n, 1), torch.cat(goals), self.lowest_goal - LEAST_HEIGHT_MARGIN_M
+        )
         step = turns * (CONTROL_PERIOD_S / time_s.clamp(min=CONTROL_PERIOD_S))
         turns, step = (torch.asinh(each / self.shape.error_scale) for each in (turns, step))
-        return torch.cat([turns, time_s, within, step], dim=1), F.pad(step, (0, 1))
+        ways = torch.cat([turns, time_s, within, step], dim=1)
+        return list(ways.chunk(n)), list(F.pad(step, (0, 1)).chunk(n))
 
-    def _say(self, features: list[Tensor], step: Tensor | float) -> tuple[Tensor, Tensor]:
-        """The output, and the features that a residual reads."""
-        inputs = torch.cat(features, dim=1)
-        out = self.head(inputs) + step
+    def _look_out(self, q: Tensor) -> Tensor:
+        """The step to where a demonstrator looks for the target, each joint as fast as it can.
+
+        Args:
+            q: Measured joint positions, (B, 7) rad.
+
+        Returns:
+            As the head says it, (B, 7).
+        """
+        bound = (CONTROL_PERIOD_S + LEAD_S) * self.joint_speed
+        turns = torch.as_tensor(LOOK_OUT_RAD).to(q) - q
+        turns[:, -1] = 0.0
+        return torch.asinh(turns.clamp(-bound, bound) / self.shape.error_scale)
+
+    def _with_residual(self, inputs: Tensor, out: Tensor) -> tuple[Tensor, Tensor]:
+        """The output with what fine-tuning adds to it, and the features that this reads."""
         known = torch.cat([inputs, out], dim=1)
         if self.residual is not None:
             out = out + self.shape.residual_bound * self.residual(known)
@@ -531,7 +559,7 @@ class HvsNetwork(nn.Module):
         if state is None:
             return out.clamp(-1.0, 1.0)
         target = state[:, :N_JOINTS] + self.to_step(out)
-        target = geometry.lifted(target, self.lowest_goal - geometry.LEAST_HEIGHT_MARGIN_M)
+        target = geometry.lifted(target, self.lowest_goal - LEAST_HEIGHT_MARGIN_M)
         return (target / self.joint_range).clamp(-1.0, 1.0)
 
     def to_step(self, out: Tensor) -> Tensor:
