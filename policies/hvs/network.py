@@ -45,7 +45,8 @@ RESIDUAL_BOUND = 0.6
 that is large, and less than two thirds of the error scale in one that is small."""
 POSITIONS_AND_VELOCITIES = 2 * N_JOINTS
 SEEN_LOGIT = 2.0
-"""How sure an eye must be (as a logit) that it sees the target before its place is remembered."""
+"""How sure an eye must be (as a logit) that it sees the target before its place is remembered, and
+that it does not, before the arm looks for it elsewhere."""
 NEVER_LOGIT = -20.0
 """What cannot be in view at all: its weight is below a float's precision beside any other."""
 ESTIMATE_FEATURES = 7
@@ -452,10 +453,12 @@ class HvsNetwork(nn.Module):
         inputs = torch.cat(features, dim=1)
         out = self.head(inputs) + self.step_gain * step + self.stride_gain * stride
         if not self.training:
-            # As long as no camera has seen the target, the head can know no way there. What it
-            # learns in training must not wait for eyes that see.
-            has_seen = remembered[:, MEMORY_SIZE - 1 :: MEMORY_SIZE].amax(dim=1, keepdim=True)
-            out = torch.where(has_seen > 0, out, self._look_out(q))
+            # As long as all cameras are sure that the target is hidden, and none has seen it before,
+            # the head can know no way there. What it learns in training must not wait for eyes.
+            has_seen = remembered[:, MEMORY_SIZE - 1 :: MEMORY_SIZE].amax(dim=1) > 0
+            for sighting in sightings.values():
+                has_seen = has_seen | (sighting.visible_logit[:, 0] > -SEEN_LOGIT)
+            out = torch.where(has_seen[:, None], out, self._look_out(q))
         out, known = self._with_residual(inputs, out)
         return Decision(out, known, sightings, target, remembered, motion)
 

@@ -5,7 +5,9 @@ import pytest
 import torch
 
 import hvs_suite
+from hvs_suite.cell.robot import JOINT_SPEED_RAD_S
 from hvs_suite.datasets.expert import Expert
+from hvs_suite.datasets.looking import LOOK_OUT_RAD
 from hvs_suite.policies.demonstrations import remembered_targets
 from hvs_suite.policies.hvs.geometry import Calibration, calibrate
 from hvs_suite.policies.hvs.network import HvsNetwork, Shape
@@ -65,6 +67,25 @@ def test_a_camera_replaces_its_own_memory_alone():
 
 def test_nothing_is_remembered_before_anything_was_seen():
     assert not look(network(-20.0)).memory.any()
+
+
+@pytest.mark.parametrize(
+    ("visible_logit", "memory", "goes_to_look"),
+    [(-20.0, (NEVER, NEVER), True), (20.0, (NEVER, NEVER), False), (-20.0, (NEVER, PLACE), False)],
+)
+def test_until_a_camera_has_seen_the_target_the_arm_goes_to_look_for_it(
+    visible_logit, memory, goes_to_look
+):
+    net = network(visible_logit)
+    bent = torch.tensor([[0.0, 0.6, 0.0, -1.4, 0.0, 1.1, 0.0]])
+    target = bent + net.to_step(look(net, *memory).out)
+    left, turn = torch.tensor(LOOK_OUT_RAD, dtype=torch.float32) - bent, target - bent
+    as_fast_as_it_can = 0.125 * torch.tensor(JOINT_SPEED_RAD_S, dtype=torch.float32)
+    there = left.sign() * torch.minimum(left.abs(), as_fast_as_it_can)
+    assert torch.allclose(turn, there, atol=1e-4) == goes_to_look
+    # The head learns from labels all the same, whatever its eyes can see by then.
+    decision = look(net.train(), *memory)
+    assert not torch.allclose(net.to_step(decision.out), there, atol=1e-2)
 
 
 def test_training_remembers_what_each_camera_saw_earlier_in_the_same_episode_alone():
