@@ -453,8 +453,8 @@ class HvsNetwork(nn.Module):
         inputs = torch.cat(features, dim=1)
         out = self.head(inputs) + self.step_gain * step + self.stride_gain * stride
         if not self.training:
-            # As long as all cameras are sure that the target is hidden, and none has seen it before,
-            # the head can know no way there. What it learns in training must not wait for eyes.
+            # As long as all cameras are sure that the target is hidden, and none has seen it, the
+            # head can know no way there. What it learns in training must not wait for eyes.
             has_seen = remembered[:, MEMORY_SIZE - 1 :: MEMORY_SIZE].amax(dim=1) > 0
             for sighting in sightings.values():
                 has_seen = has_seen | (sighting.visible_logit[:, 0] > -SEEN_LOGIT)
