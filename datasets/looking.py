@@ -12,8 +12,7 @@ place above it, from which it will.
 
 And where the arm may start anywhere, it goes there in one of two postures, the elbow straight above
 the line from shoulder to wrist, A1 towards the target or away from it: the one whose slowest joint
-arrives first at full speed, if the straight way there in joint space does not dip below the goal.
-The expert chooses the soonest of some two thousand, and which that is
+arrives first at full speed. The expert chooses the soonest of some two thousand, and which that is
 jumps with every little change of where the arm stands: nobody could learn it
 (docs/experiments/simple-ways.md). Two postures cost three steps.
 """
@@ -44,11 +43,6 @@ PLAIN_SWIVELS = 1
 LOOK_DOWN_M = 0.15
 """How far above the goal the eye in the hand looks for the target (m): high enough to have it in
 view wherever the eye-to-hand camera may take it to be, and hardly a detour."""
-LEAST_HEIGHT_MARGIN_M = 0.01
-"""How far below the goal a way may lead the flange (m): more than anyone overshoots who is at rest
-soon, and less than the height over the surface at which goals lie."""
-WAY_POINTS = 7
-"""Places along a way at which its height is looked at."""
 
 
 class Demonstrator(Expert):
@@ -94,15 +88,7 @@ class Demonstrator(Expert):
         if not self._is_plain:
             return super()._in_order(q, velocity, family)
         times = (np.abs(family - q) / JOINT_SPEED_RAD_S)[:, :6].max(axis=1)
-        dips = [self._dips(q, goal) for goal in family]
-        return iter(family[np.lexsort((times, dips))])
-
-    def _dips(self, q: FloatArray, goal: FloatArray) -> bool:
-        """Whether the straight way in joint space leads the flange below the goal."""
-        shares = np.arange(1, WAY_POINTS + 1) / (WAY_POINTS + 1)
-        way = q + shares[:, None] * (goal - q)
-        least = min(self._kinematics.flange_pose(point)[1][2] for point in way)
-        return bool(least < self._env.task.goal[2] - LEAST_HEIGHT_MARGIN_M)
+        return iter(family[np.argsort(times, kind="stable")])
 
     def _nearest_goal(
         self, rest: FloatArray, position: FloatArray, normal: FloatArray

@@ -23,7 +23,6 @@ from hvs_suite.cell.robot import (
     SHOULDER_TO_ELBOW_M,
     WRIST_TO_FLANGE_M,
 )
-from hvs_suite.datasets.looking import WAY_POINTS
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -33,9 +32,11 @@ DAMPING_M = 0.03
 # Offsets are shortened to this before the inverse, which only holds near the goal.
 LINEARISATION_RANGE_M = 0.10
 LINEARISATION_RANGE_RAD = 0.30
-# Added to the time of a way that leads out of the joint ranges, and of one that is too low.
+# Added to the time of a way that leads out of the joint ranges.
 UNREACHABLE_S = 100.0
-TOO_LOW_S = 10.0
+# How far below the lowest goal the flange may be sent (m): more than anyone overshoots who is at
+# rest soon, and less than the height over the surface at which goals lie.
+LEAST_HEIGHT_MARGIN_M = 0.01
 # Rounds of Gauss-Newton that lift the flange, and their damping.
 LIFTS = 4
 LIFT_DAMPING_M = 0.05
@@ -104,27 +105,6 @@ def flange_motion(q: Tensor) -> FlangeMotion:
     return FlangeMotion(position, rotations[:, -1], jacobian)
 
 
-def flange_height(q: Tensor) -> Tensor:
-    """Height of the flange face centre above the base.
-
-    Args:
-        q: Angles of A1 to A6, (B, 6) rad; A7 does not move it.
-
-    Returns:
-        (B,) m.
-    """
-    fixed, sine, cosine, ways, _ = (table.to(q) for table in _JOINTS)
-    angle = q[:, :, None, None]
-    turns = fixed[:6] + sine[:6] * torch.sin(angle) + cosine[:6] * torch.cos(angle)
-    # The upward axis in each link's frame; a link contributes its z component times its length.
-    up = torch.eye(3, dtype=q.dtype, device=q.device)[2:].expand(len(q), 1, 3)
-    height = ways[0].expand(len(q))
-    for turn, way in zip(turns.unbind(dim=1), (*ways[1:6], ways[6] + ways[7]), strict=True):
-        up = up @ turn
-        height = height + up[:, 0, 2] * way
-    return height
-
-
 def joint_step(motion: FlangeMotion, offset: Tensor) -> Tensor:
     """Damped least-squares step that puts the flange at an offset, facing straight down.
 
@@ -190,19 +170,14 @@ def postures(goal: Tensor) -> Tensor:
         return torch.stack([one, other], dim=1)
 
 
-def way_to_posture(
-    q: Tensor, goal: Tensor, least_height_m: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def way_to_posture(q: Tensor, goal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The way to the nearer of the two plain postures that lie within the joint ranges.
 
-    Nearer is where the slowest joint arrives first at full speed; a way that leads the flange too
-    low is taken only where the other is no better. So a demonstrator chooses
-    (`hvs_suite.datasets.looking`).
+    Nearer is where the slowest joint arrives first at full speed, as a demonstrator reckons.
 
     Args:
         q: Joint angles, (B, 7) rad.
         goal: Of the flange, (B, 3) m. No gradient flows through it.
-        least_height_m: Least height of the flange on the way, scalar (m).
 
     Returns:
         The turns of A1 to A6 that are left, (B, 6) rad, the time of the slowest, (B, 1) s, and 1 if
@@ -214,13 +189,7 @@ def way_to_posture(
     ways = ends - q[:, None, :-1]
     times = (ways.abs() / speed).amax(dim=2)
     within = (ends.abs() <= limit).all(dim=2)
-    with torch.no_grad():
-        shares = torch.arange(1, WAY_POINTS + 1).to(q)[:, None] / (WAY_POINTS + 1)
-        points = q[:, None, None, :-1] + shares * ways[:, :, None]
-        heights = flange_height(points.flatten(0, 2)).view(len(q), 2, WAY_POINTS)
-        too_low = heights.amin(dim=2) < least_height_m
-        price = times + UNREACHABLE_S * ~within + TOO_LOW_S * too_low
-    nearer = price.argmin(dim=1)
+    nearer = torch.where(within, times, times + UNREACHABLE_S).argmin(dim=1)
     row = torch.arange(len(q), device=q.device)
     return ways[row, nearer], times[row, nearer, None], within[row, nearer, None].to(q)
 

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
 from hvs_suite.datasets.expert import LEAD_S
-from hvs_suite.datasets.looking import LEAST_HEIGHT_MARGIN_M, LOOK_DOWN_M, LOOK_OUT_RAD
+from hvs_suite.datasets.looking import LOOK_DOWN_M, LOOK_OUT_RAD
 from hvs_suite.policies.hvs import geometry
 from hvs_suite.policies.hvs.geometry import Calibration
 
@@ -476,9 +476,7 @@ class HvsNetwork(nn.Module):
             scale.
         """
         n = len(goals)
-        turns, time_s, within = geometry.way_to_posture(
-            q.repeat(n, 1), torch.cat(goals), self.lowest_goal - LEAST_HEIGHT_MARGIN_M
-        )
+        turns, time_s, within = geometry.way_to_posture(q.repeat(n, 1), torch.cat(goals))
         step = turns * (CONTROL_PERIOD_S / time_s.clamp(min=CONTROL_PERIOD_S))
         turns, step = (torch.asinh(each / self.shape.error_scale) for each in (turns, step))
         ways = torch.cat([turns, time_s, within, step], dim=1)
@@ -562,7 +560,7 @@ class HvsNetwork(nn.Module):
         if state is None:
             return out.clamp(-1.0, 1.0)
         target = state[:, :N_JOINTS] + self.to_step(out)
-        target = geometry.lifted(target, self.lowest_goal - LEAST_HEIGHT_MARGIN_M)
+        target = geometry.lifted(target, self.lowest_goal - geometry.LEAST_HEIGHT_MARGIN_M)
         return (target / self.joint_range).clamp(-1.0, 1.0)
 
     def to_step(self, out: Tensor) -> Tensor:

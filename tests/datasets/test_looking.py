@@ -8,7 +8,7 @@ import hvs_suite
 from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.cell.robot import JOINT_SPEED_RAD_S
 from hvs_suite.datasets.expert import Expert
-from hvs_suite.datasets.looking import LEAST_HEIGHT_MARGIN_M, Demonstrator
+from hvs_suite.datasets.looking import Demonstrator
 
 SCENES = 100
 
@@ -94,11 +94,7 @@ def test_from_a_random_start_the_way_is_the_one_that_the_policy_takes_to_be_the_
             env.reset(scenario=scenario)
             truth = env.privileged()
             q, goal = truth["joint_positions"], truth["goal_position"]
-            turns, time_s, within = way_to_posture(
-                torch.tensor(q[None]),
-                torch.tensor(goal[None]),
-                torch.tensor(goal[2] - LEAST_HEIGHT_MARGIN_M),
-            )
+            turns, time_s, within = way_to_posture(torch.tensor(q[None]), torch.tensor(goal[None]))
             demonstrator._remember_goal(goal, truth["goal_normal"])
             family = demonstrator._reachable(q, np.zeros(7), goal, truth["goal_normal"])
             both += len(family) == 2
