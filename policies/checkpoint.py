@@ -6,6 +6,7 @@ that both ways give the same action. Anything else goes through LeRobot.
 """
 
 import dataclasses
+import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -262,6 +263,21 @@ def load_network(folder: Path, config: Mapping[str, Any]) -> HvsNetwork:
         reason = str(error).splitlines()[0]
         raise PolicyError(f"{folder} cannot be loaded as an hvs policy: {reason}") from error
     return network.eval()
+
+
+def weights_digest(folder: Path) -> str:
+    """SHA-256 of a checkpoint's weights.
+
+    Args:
+        folder: The checkpoint.
+
+    Raises:
+        PolicyError: It has none.
+    """
+    try:
+        return hashlib.sha256((folder / "model.safetensors").read_bytes()).hexdigest()
+    except OSError as error:
+        raise PolicyError(f"{folder} holds no model.safetensors that can be read") from error
 
 
 def _network(folder: Path, config: Mapping[str, Any]) -> tuple[Decide, Callable[[], None]]:

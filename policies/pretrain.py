@@ -20,6 +20,7 @@ import torch
 from hvs_suite.errors import OptionError
 from hvs_suite.files import replacing
 from hvs_suite.policies.allocator import keep_freed_memory
+from hvs_suite.policies.checkpoint import weights_digest
 from hvs_suite.policies.dagger import RoundSummary, play_round, read_round, round_shares
 from hvs_suite.policies.demonstrations import (
     Demonstrations,
@@ -31,6 +32,7 @@ from hvs_suite.policies.frame_cache import fingerprint
 from hvs_suite.policies.pretrain_settings import (
     Settings,
     new_policy,
+    take_eyes,
     tightest_scale,
 )
 from hvs_suite.policies.run_folder import claim, write_train_config
@@ -121,6 +123,7 @@ def pretrain(
     rehearsal_frames: int = 512,
     keypoint_weight: float = 1.0,
     error_scale: float | None = None,
+    eyes: Path | None = None,
     workers: int = 2,
     checkpoint_period_s: float = 60.0,
     on_progress: Callable[[Progress], None] | None = None,
@@ -145,6 +148,7 @@ def pretrain(
             `hvs_suite.policies.hvs.rehearsal`.
         keypoint_weight: Weight of the supervision by ``privileged.*``; 0 trains on actions alone.
         error_scale: See `HvsConfig`; None for five times the task's tightest tolerance.
+        eyes: Checkpoint of a policy to take the eyes of, see `take_eyes`; None for fresh ones.
         workers: Processes that play the rounds; any number gives the same.
         checkpoint_period_s: Time between checkpoints (s).
         on_progress: Called while decoding and after every step.
@@ -156,6 +160,7 @@ def pretrain(
         DatasetError: The dataset cannot be trained on, or was recorded on ``test``.
         OptionError: No budget, or a number that makes no sense.
         OutputError: ``out`` cannot be written, or holds something else than this run.
+        PolicyError: The eyes do not fit.
     """
     _check_budget(minutes, steps)
     if workers < 1:
@@ -175,6 +180,7 @@ def pretrain(
         rehearsal_frames=rehearsal_frames,
         keypoint_weight=keypoint_weight,
         error_scale=tightest_scale(manifest) if error_scale is None else error_scale,
+        eyes=None if eyes is None else weights_digest(eyes),
     )
     settings.check(manifest)
     if inputs is not None:
@@ -184,12 +190,15 @@ def pretrain(
     claim(out, dataclasses.asdict(settings))
     training = out / "training"
     policy = new_policy(manifest, settings)
+    if eyes is not None:
+        take_eyes(policy, eyes)
     write_train_config(
         out,
         dataclasses.asdict(settings),
         {"minutes": minutes, "steps": steps},
         PACKAGES,
         data=str(data),
+        eyes=None if eyes is None else str(eyes),
         policy={
             "type": "hvs",
             "channels": policy.config.channels,

@@ -2,11 +2,14 @@
 
 import dataclasses
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
+from torch import nn
 
-from hvs_suite.errors import OptionError
+from hvs_suite.errors import OptionError, PolicyError
+from hvs_suite.policies.checkpoint import load_network, read_config
 from hvs_suite.policies.demonstrations import Manifest, calibration_of
 from hvs_suite.policies.hvs.network import IMAGE_PREFIX, STATE, Eye
 from hvs_suite.registry import find
@@ -33,6 +36,7 @@ class Settings:
         rehearsal_frames: Frames a step that the head alone learns from.
         keypoint_weight: Of the policy.
         error_scale: Of the policy.
+        eyes: SHA-256 of the weights whose eyes it begins with; None for fresh ones.
     """
 
     seed: int
@@ -47,6 +51,7 @@ class Settings:
     rehearsal_frames: int
     keypoint_weight: float
     error_scale: float
+    eyes: str | None
 
     def check(self, manifest: Manifest) -> None:
         """Refuse numbers that make no sense.
@@ -123,3 +128,37 @@ def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":
         if isinstance(module, Eye):
             module.train_in_bfloat16 = torch.cpu._is_avx512_bf16_supported()
     return policy
+
+
+def take_eyes(policy: "HvsPolicy", folder: Path) -> None:
+    """Begin with the eyes of another policy, for each camera whose layers are alike.
+
+    Eyes that found larger targets find smaller ones soon; fresh ones may never get to see a target
+    of three pixels (docs/experiments/small-targets.md).
+
+    Args:
+        policy: Whose eyes to replace.
+        folder: Checkpoint of an `hvs` policy.
+
+    Raises:
+        PolicyError: It is none, or no camera has the same layers in both.
+    """
+    config = read_config(folder)
+    if config.get("type") != "hvs":
+        raise PolicyError(f"{folder} holds a policy of type {config.get('type')}, not hvs")
+    others = load_network(folder, config).eyes
+    eyes = policy.network.eyes
+    alike = [
+        name for name in eyes if name in others and _shapes(eyes[name]) == _shapes(others[name])
+    ]
+    if not alike:
+        raise PolicyError(
+            f"{folder} has no eyes that fit {', '.join(eyes)}: their layers depend on the images' "
+            "sides and channels"
+        )
+    for name in alike:
+        eyes[name].load_state_dict(others[name].state_dict())
+
+
+def _shapes(module: nn.Module) -> dict[str, torch.Size]:
+    return {name: weight.shape for name, weight in module.state_dict().items()}

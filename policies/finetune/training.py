@@ -8,7 +8,6 @@ same command is given again.
 
 import contextlib
 import dataclasses
-import hashlib
 import json
 import math
 import shutil
@@ -24,7 +23,12 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from hvs_suite.policies.allocator import keep_freed_memory
-from hvs_suite.policies.checkpoint import CheckpointPolicy, check_fit, read_config
+from hvs_suite.policies.checkpoint import (
+    CheckpointPolicy,
+    check_fit,
+    read_config,
+    weights_digest,
+)
 from hvs_suite.policies.finetune.eyes import train_eyes
 from hvs_suite.policies.finetune.folding import load_base, with_residual, write_folded
 from hvs_suite.policies.finetune.residual_td3 import ResidualPolicy, ResidualTD3
@@ -101,7 +105,7 @@ def finetune(
     keep_freed_memory()
     torch.set_num_threads(min(2, torch.get_num_threads()))
     identity = {
-        "base": hashlib.sha256((policy / "model.safetensors").read_bytes()).hexdigest(),
+        "base": weights_digest(policy),
         "task": task,
         "task_version": variant.version,
         "options": json.loads(json.dumps(options)),

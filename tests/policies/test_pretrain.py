@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from safetensors.torch import load_file
 
-from hvs_suite.errors import DatasetError, OptionError, OutputError
+from hvs_suite.errors import DatasetError, OptionError, OutputError, PolicyError
 from hvs_suite.policies.demonstrations import Demonstrations, read_manifest
 from hvs_suite.policies.pretrain import pretrain
 
@@ -125,6 +125,22 @@ def test_errors_weigh_by_the_tolerance_unless_told_otherwise(dataset, tmp_path):
         pretrain(dataset, tmp_path / name, steps=1, batch_size=4, **options)
         scales.append(json.loads((tmp_path / name / "config.json").read_text())["error_scale"])
     assert scales == [0.025, 0.5]
+
+
+def test_eyes_of_another_policy_are_where_training_begins(dataset, large_dataset, tmp_path):
+    learned, out = tmp_path / "learned", tmp_path / "run"
+    pretrain(dataset, learned, steps=2, batch_size=4)
+    pretrain(dataset, out, steps=1, batch_size=4, learning_rate=1e-9, seed=1, eyes=learned)
+    after = weights(out)
+    for name, before in weights(learned).items():
+        change = (after[name] - before).abs().max().item()
+        assert change < 1e-6 or ".eyes." not in name
+        assert change > 1e-6 or ".head." not in name or "bias" in name
+    assert json.loads((out / "train_config.json").read_text())["settings"]["eyes"]
+    with pytest.raises(PolicyError, match=r"no config\.json"):
+        pretrain(dataset, tmp_path / "other", steps=1, eyes=tmp_path)
+    with pytest.raises(PolicyError, match="no eyes that fit"):
+        pretrain(large_dataset, tmp_path / "large", steps=1, batch_size=4, eyes=learned)
 
 
 def test_data_recorded_on_the_test_split_is_refused(tmp_path):

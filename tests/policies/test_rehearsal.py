@@ -66,7 +66,7 @@ def test_it_teaches_the_head_and_leaves_the_eyes_alone(dataset, tmp_path):
     settings = Settings(
         seed=0, batch_size=4, learning_rate=1e-3, dagger_rounds=0, dagger_frames=1, dataset="",
         task=manifest.task, inputs=None, episodes=None, rehearsal_frames=16, keypoint_weight=1.0,
-        error_scale=0.005,
+        error_scale=0.005, eyes=None,
     )  # fmt: skip
     policy = new_policy(manifest, settings)
     demonstrations = Demonstrations(manifest, tmp_path / "cache", 0)
