@@ -137,7 +137,7 @@ def test_eyes_of_another_policy_are_where_training_begins(dataset, large_dataset
         assert change < 1e-6 or ".eyes." not in name
         assert change > 1e-6 or ".head." not in name or "bias" in name
     assert json.loads((out / "train_config.json").read_text())["settings"]["eyes"]
-    with pytest.raises(PolicyError, match=r"no config\.json"):
+    with pytest.raises(PolicyError, match=r"no model\.safetensors"):
         pretrain(dataset, tmp_path / "other", steps=1, eyes=tmp_path)
     with pytest.raises(PolicyError, match="no eyes that fit"):
         pretrain(large_dataset, tmp_path / "large", steps=1, batch_size=4, eyes=learned)
