@@ -446,10 +446,9 @@ class HvsNetwork(nn.Module):
             features.append(torch.asinh((depth - self.standoff) / scale))
         if self.shape.state_dim == POSITIONS_AND_VELOCITIES:
             features.append(state[:, N_JOINTS:] / self.joint_speed)
-        for estimate in estimates:
-            offset = estimate[:, :3] + lift - motion.position
-            in_flange = (offset[:, None] @ motion.rotation)[:, 0]
-            features += [offset, torch.asinh(in_flange / scale), estimate[:, 3:]]
+        offsets = estimates[:, :, :3] + (lift - motion.position)[:, None]
+        in_flange = torch.asinh(offsets @ motion.rotation / scale)
+        features.append(torch.cat([offsets, in_flange, estimates[:, :, 3:]], dim=2).flatten(1))
         inputs = torch.cat(features, dim=1)
         out = self.head(inputs) + self.step_gain * step + self.stride_gain * stride
         if not self.training:
@@ -458,7 +457,8 @@ class HvsNetwork(nn.Module):
             has_seen = remembered[:, MEMORY_SIZE - 1 :: MEMORY_SIZE].amax(dim=1) > 0
             for sighting in sightings.values():
                 has_seen = has_seen | (sighting.visible_logit[:, 0] > -SEEN_LOGIT)
-            out = torch.where(has_seen[:, None], out, self._look_out(q))
+            if not has_seen.all():
+                out = torch.where(has_seen[:, None], out, self._look_out(q))
         out, known = self._with_residual(inputs, out)
         return Decision(out, known, sightings, target, remembered, motion)
 
@@ -505,7 +505,7 @@ class HvsNetwork(nn.Module):
 
     def _place(
         self, motion: geometry.FlangeMotion, sightings: Mapping[str, Sighting], memory: Tensor
-    ) -> tuple[Tensor, list[Tensor], Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Put the target into space.
 
         A camera counts as far as it sees the target and is to be trusted; what it remembers, as far
@@ -513,8 +513,8 @@ class HvsNetwork(nn.Module):
         centimetres off, and what the eye in hand saw a second ago is better.
 
         Returns:
-            The best estimate (B, 3) m, every estimate with its weight, (B, 4) each, and the next
-            memory (B, 4 n).
+            The best estimate (B, 3) m; every estimate with its weight, (B, 2 n + 1, 4), what n
+            cameras see, what they remember, and the best; and the next memory (B, 4 n).
         """
         places, logits, slots, hidden, held = [], [], [], [], []
         never = motion.position.new_full((len(motion.position), 1), NEVER_LOGIT)
@@ -539,10 +539,8 @@ class HvsNetwork(nn.Module):
         best = (weights[:, :, None] * stacked).sum(dim=1)
         # An empty memory stands at the best estimate, so that it says nothing.
         places += [torch.where(slot[:, 3:] > 0, slot[:, :3], best) for slot in slots]
-        estimates = [
-            torch.cat([place, weights[:, i : i + 1]], dim=1) for i, place in enumerate(places)
-        ]
-        estimates.append(torch.cat([best, weights[:, :now].sum(dim=1, keepdim=True)], dim=1))
+        weights = torch.cat([weights, weights[:, :now].sum(dim=1, keepdim=True)], dim=1)
+        estimates = torch.cat([torch.stack([*places, best], dim=1), weights[:, :, None]], dim=2)
         return best, estimates, torch.cat(held, dim=1).detach()
 
     def to_action(self, out: Tensor, state: Tensor | None) -> Tensor:
