@@ -198,7 +198,6 @@ def pretrain(
         {"minutes": minutes, "steps": steps},
         PACKAGES,
         data=str(data),
-        eyes=None if eyes is None else str(eyes),
         policy={
             "type": "hvs",
             "channels": policy.config.channels,

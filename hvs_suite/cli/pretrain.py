@@ -37,8 +37,8 @@ class Pretrain:
         keypoint_weight: Weight of the supervision by where the target is; 0 trains on actions.
         error_scale: Errors of a joint's step (rad) and of a place (m) weigh linearly below this
             and logarithmically above; five times the task's tightest tolerance by default.
-        eyes: Checkpoint of a policy to begin with the eyes of, where a target is too small for
-            fresh ones to find.
+        eyes: Policy to begin with the eyes of, where a target is too small for fresh ones to find:
+            a checkpoint folder, or a named task for the weights shipped for it.
         workers: Processes that play the rounds.
         seed: Of initial weights, held-out episodes and order.
     """
@@ -54,7 +54,7 @@ class Pretrain:
     rehearsal_frames: int = 512
     keypoint_weight: float = 1.0
     error_scale: float | None = None
-    eyes: Path | None = None
+    eyes: str | None = None
     workers: int = 2
     seed: int = 0
 
@@ -78,7 +78,7 @@ class Pretrain:
                 rehearsal_frames=self.rehearsal_frames,
                 keypoint_weight=self.keypoint_weight,
                 error_scale=self.error_scale,
-                eyes=self.eyes,
+                eyes=None if self.eyes is None else _folder(self.eyes),
                 workers=self.workers,
                 seed=self.seed,
                 on_progress=lambda state: update(state.stage, state.share, _words(state)),
@@ -97,6 +97,14 @@ class Pretrain:
         )
         print(f"loss {outcome.loss:.4f}{held_out}")
         print(f"wrote {self.out}")
+
+
+def _folder(eyes: str) -> Path:
+    """The checkpoint that eyes are taken from."""
+    from hvs_suite.policies.catalogue import checkpoint_folder
+    from hvs_suite.tasks.variants import TASKS
+
+    return checkpoint_folder("pretrained", eyes) if eyes in TASKS else Path(eyes)
 
 
 def _words(state: "Progress") -> str:
