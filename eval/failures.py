@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from hvs_suite import registry
+from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.errors import ResultError
 from hvs_suite.eval import action_log, result_file
 from hvs_suite.eval.result_file import EpisodeRow
@@ -57,8 +57,9 @@ class Failure:
         position_error_mm: At the end (mm).
         tilt_error_deg: At the end (deg).
         seen_steps: Decisions at which a camera had the target in view.
-        estimate_error_mm: How far off the policy took the target to be at its last decision (mm);
-            None where the policy does not say.
+        estimate_error_mm: How far off sideways the policy took the target to be at its last
+            decision (mm), as seen from the flange: where the joints measure wrongly it need not
+            know where either of them stands. None where the policy does not say.
         target_radius_m: Distance of the target from the base's axis (m).
     """
 
@@ -157,7 +158,7 @@ def _sort(
     time_step = env.reset(scenario=row.scenario)
     target = np.asarray(env.privileged()["target_position"])
     memory: Any = None
-    estimate: npt.NDArray[np.float64] | None = None
+    off_mm: float | None = None
     seen = 0
     errors_mm = [float(env.info["position_error_mm"])]
     spec = env.action_spec()
@@ -170,12 +171,13 @@ def _sort(
             with torch.inference_mode(), one_torch_thread():
                 decision = network(*network_inputs(network, time_step.observation), memory)
             memory = decision.memory
-            if decision.target is not None:
-                estimate = decision.target[0].double().numpy()
+            if decision.target is not None and decision.motion is not None:
+                _, flange = kinematics().flange_pose(env.joint_positions)
+                believed = (decision.target - decision.motion.position)[0].double().numpy()
+                off_mm = 1e3 * float(np.linalg.norm((believed - (target - flange))[:2]))
         executed = np.clip(action, spec.minimum, spec.maximum).astype(np.float32)
         time_step = env.step(executed)
         errors_mm.append(float(env.info["position_error_mm"]))
-    off_mm = None if estimate is None else 1e3 * float(np.linalg.norm((estimate - target)[:2]))
     return Failure(
         scenario=row.scenario,
         cause=cause_of(row, env.variant, seen, off_mm, errors_mm),
