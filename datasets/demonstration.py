@@ -16,13 +16,19 @@ import numpy.typing as npt
 
 from hvs_suite.cell.robot import JOINT_RANGE_RAD
 from hvs_suite.datasets.episode_stats import FeatureStats, column_stats, picture_stats
-from hvs_suite.datasets.features import Frame, acted_part, dataset_features, observed_part
+from hvs_suite.datasets.features import (
+    Frame,
+    acted_part,
+    dataset_features,
+    image_key,
+    observed_part,
+)
 from hvs_suite.datasets.png import encode
 from hvs_suite.registry import load
 from hvs_suite.rollout import Policy
 
 if TYPE_CHECKING:
-    from hvs_suite.cell.environment import Environment
+    from hvs_suite.cell.environment import Environment, Moment
 
 NOISE_STREAM = "demonstration-noise"
 NOISE_TIME_S = 0.3
@@ -88,14 +94,16 @@ class Demonstrate:
 
     def __call__(self, env: "Environment", expert: Policy, scenario: int) -> Demonstration:
         """Plays one scenario to its end."""
-        # A frame holds what was seen before its control step, so none holds what the last shows.
-        env.observes_end = False
+        # The expert does not look, so the pictures can wait.
+        env.draws = False
         time_step = env.reset(scenario=scenario)
         expert.reset()
         perturbation = _Perturbation(env, scenario, self.noise) if self.noise > 0.0 else None
         frames: list[Frame] = []
+        moments: list[Moment] = []
         while not time_step.last():
             frame = observed_part(env.variant, time_step.observation, env)
+            moments.append(env.moment())
             action = expert.select_action(time_step.observation)
             executed = action if perturbation is None else perturbation.apply(action)
             time_step = env.step(executed)
@@ -107,6 +115,9 @@ class Demonstrate:
                 env.info["is_success"],
             )
             frames.append(frame)
+        for camera, drawn in env.pictures(moments).items():
+            for frame, picture in zip(frames, drawn, strict=True):
+                frame[image_key(camera)] = picture
         return packed(scenario, frames, dataset_features(env.variant), env.info)
 
 

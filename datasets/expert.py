@@ -48,8 +48,6 @@ LEAD_S = 0.025
 the fewest steps. More overshoots the goal, less arrives late."""
 
 _FULL_SPEED: FloatArray = robot.JOINT_SPEED_RAD_S[:6, None]
-_SHORT_LIST = 128
-"""How many configurations to time at first; rarely more are needed."""
 _LAG_S: FloatArray = robot.DAMPING_NM_S_RAD / robot.STIFFNESS_NM_RAD
 """Each joint trails a moving set point by kv / kp (s)."""
 _MAX_PATHS = 24
@@ -102,39 +100,6 @@ def _stopping_travel_time(
     return times.max(axis=0), ((way / w) ** 2).sum(axis=0)
 
 
-def _soonest_first(
-    q: FloatArray, velocity: FloatArray, family: FloatArray
-) -> collections.abc.Iterator[FloatArray]:
-    """Configurations (7,) of a family (m, 7), the one reached soonest first.
-
-    The first is nearly always clear, so it is found without ranking all: no time is below that at
-    full speed, so only configurations that could be soonest by that bound are timed.
-    """
-    # Joint by joint along the first axis: NumPy is slow over rows of seven.
-    joints = np.ascontiguousarray(family[:, :6].T)
-
-    def price(goals: FloatArray) -> FloatArray:
-        times, effort = _stopping_travel_time(q[:6], velocity[:6], goals)
-        return times + TIE_BREAK_S * effort
-
-    bound = (np.abs(joints - q[:6, None]) / _FULL_SPEED).max(axis=0)
-    last = min(_SHORT_LIST, len(family)) - 1
-    nearest = np.argpartition(bound, last)[: last + 1]
-    # In the family's order, on which equal prices depend.
-    listed = np.sort(nearest)
-    prices = price(joints.take(listed, axis=1))
-    # A little slack, because both sides are rounded.
-    limit = prices.min() + 1e-9
-    if limit >= bound[nearest[-1]]:
-        [listed] = np.nonzero(bound <= limit)
-        prices = price(joints.take(listed, axis=1))
-    first = int(listed[prices.argmin()])
-    yield family[first]
-    for column in np.argsort(price(joints), kind="stable").tolist():
-        if column != first:
-            yield family[column]
-
-
 class Expert:
     """Answers with the best action for the environment's present state.
 
@@ -168,6 +133,8 @@ class Expert:
         self._floor_m = 0.0
         self._clearance_m = 0.0
         """Of the present state."""
+        self._soonest_s = math.inf
+        """What the soonest way to the goal took a control step ago (s)."""
         self._decay = np.exp(-self._period_s / _LAG_S)
         self._ruckig = ruckig.Ruckig(7)
         self._input = ruckig.InputParameter(7)
@@ -208,6 +175,7 @@ class Expert:
         key = position.tobytes() + normal.tobytes()
         if key != self._goal_key:
             self._goal_key = key
+            self._soonest_s = math.inf
             self._across = np.linalg.svd(normal[None])[2][1:]
             family = self._kinematics.goal_configurations_at_tool_angle(
                 position, normal, tool_angle=0.0, n_swivel=self.n_swivel
@@ -251,8 +219,31 @@ class Expert:
     def _in_order(
         self, q: FloatArray, velocity: FloatArray, family: FloatArray
     ) -> collections.abc.Iterator[FloatArray]:
-        """Goal configurations (7,) of a family (m, 7), the one to take first."""
-        return _soonest_first(q, velocity, family)
+        """Goal configurations (7,) of a family (m, 7), the one reached soonest first.
+
+        The first is nearly always clear, so it is found without timing all: none is reached sooner
+        than at full speed, and as a rule the soonest is no farther away than it was a control step
+        ago. Where that fails all are timed, so the answer does not depend on the last one.
+        """
+        # Joint by joint along the first axis: NumPy is slow over rows of seven.
+        joints = family[:, :6].T
+
+        def price(goals: FloatArray) -> FloatArray:
+            times, effort = _stopping_travel_time(q[:6], velocity[:6], goals)
+            return times + TIE_BREAK_S * effort
+
+        bound = (np.abs(joints - q[:6, None]) / _FULL_SPEED).max(axis=0)
+        [listed] = np.nonzero(bound <= self._soonest_s)
+        prices = price(joints.take(listed, axis=1))
+        if len(listed) == 0 or prices.min() > self._soonest_s:
+            listed, prices = np.arange(len(family)), price(joints)
+        least = int(prices.argmin())
+        # A little slack, because bounds and prices are rounded.
+        self._soonest_s, first = float(prices[least]) + 1e-9, int(listed[least])
+        yield family[first]
+        for column in np.argsort(price(joints), kind="stable").tolist():
+            if column != first:
+                yield family[column]
 
     def _point_ahead(self, motion: ruckig.Trajectory) -> FloatArray:
         """Where a motion is at the end of the control step (7,); the arm trails its set point."""

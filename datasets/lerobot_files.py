@@ -112,15 +112,16 @@ def data_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
     )
 
 
-def data_table(schema: pa.Schema, columns: Columns) -> pa.Table:
-    """The rows of an episode.
+def data_table(schema: pa.Schema, episodes: Sequence[Columns]) -> pa.Table:
+    """The rows of some episodes.
 
     Args:
         schema: As ``data_schema`` gives it.
-        columns: Feature to values (n, k) or (n,), or to n PNG files.
+        episodes: Feature to values (n, k) or (n,), or to n PNG files, of each episode.
     """
     return pa.Table.from_arrays(
-        [_array(field.type, columns[field.name]) for field in schema], schema=schema
+        [_array(field.type, [columns[field.name] for columns in episodes]) for field in schema],
+        schema=schema,
     )
 
 
@@ -234,13 +235,14 @@ def write_info(
     _write_json(root / INFO, content)
 
 
-def _array(kind: pa.DataType, values: npt.NDArray[Any] | Sequence[bytes]) -> pa.Array:
-    """A column of an episode in its type."""
+def _array(kind: pa.DataType, episodes: Sequence[npt.NDArray[Any] | Sequence[bytes]]) -> pa.Array:
+    """A column of some episodes in its type."""
     if pa.types.is_struct(kind):
-        names = [f"frame-{frame:06d}.png" for frame in range(len(values))]
-        content = [pa.array(values, pa.binary()), pa.array(names, pa.string())]
+        names = [f"frame-{frame:06d}.png" for files in episodes for frame in range(len(files))]
+        pictures = [picture for files in episodes for picture in files]
+        content = [pa.array(pictures, pa.binary()), pa.array(names, pa.string())]
         return pa.StructArray.from_arrays(content, fields=list(kind))
-    flat = np.asarray(values).reshape(-1)
+    flat = np.concatenate([np.asarray(values).reshape(-1) for values in episodes])
     if pa.types.is_fixed_size_list(kind):
         return pa.FixedSizeListArray.from_arrays(pa.array(flat, kind.value_type), type=kind)
     # PyArrow narrows no float64 by itself.

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy.typing as npt
+import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hvs_suite.datasets import lerobot_files as files
@@ -25,6 +26,8 @@ from hvs_suite.errors import DatasetError, OutputError
 
 STAGE = ".recording"
 """Hidden folder inside the dataset that holds the block being written."""
+_WRITTEN_TOGETHER = 5
+"""Episodes that become one Arrow table: making one costs more than most episodes' numbers do."""
 _DATA_PLACE = ("data/chunk_index", "data/file_index")
 _EPISODE_PLACE = ("meta/episodes/chunk_index", "meta/episodes/file_index")
 # Counts come last: until then readers see the dataset as it was before the block.
@@ -52,19 +55,17 @@ class _Published:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Episode:
-    """What is to be said of an episode whose frames are written.
+    """What is to be said of an episode.
 
     Attributes:
         first: Index of its first frame in the dataset.
         length: Its frames.
-        data_file: Number of its data file.
         counters: The columns that LeRobot adds.
         stats: Statistics of all other columns.
     """
 
     first: int
     length: int
-    data_file: int
     counters: Mapping[str, npt.NDArray[Any]]
     stats: Mapping[str, FeatureStats]
 
@@ -111,26 +112,21 @@ class DatasetWriter:
             self._open = _Block(self._published.data_files)
         block, before = self._open, self._published
         length, first = demonstration.length, before.frames + block.frames
-        episode = before.episodes + len(block.episodes)
-        counters = files.counters(length, episode, first, self._fps)
-        table = files.data_table(self._schema, {**demonstration.columns, **counters})
-        # An interrupt in here would leave rows that are not listed.
-        block.torn = True
-        block.write(self._stage, table)
-        block.episodes.append(
-            _Episode(first, length, block.data_file, counters, demonstration.stats)
-        )
-        block.frames += length
-        block.torn = False
-        if len(block.episodes) >= self._block:
+        counters = files.counters(length, before.episodes + block.size, first, self._fps)
+        episode = _Episode(first, length, counters, demonstration.stats)
+        block.waiting.append((episode, {**demonstration.columns, **counters}))
+        if block.size >= self._block:
             self.publish()
+        elif len(block.waiting) >= _WRITTEN_TOGETHER:
+            block.write(self._stage, self._schema)
 
     def publish(self) -> None:
         """Closes the open block, if any, and moves it into place."""
         block, before = self._open, self._published
-        if block is None or before is None or block.torn or not block.episodes:
+        if block is None or before is None or block.torn or not block.size:
             self.discard()
             return
+        block.write(self._stage, self._schema)
         block.close()
         names = files.with_counters(self._features)
         stats = _stats_of_block(block.episodes)
@@ -140,10 +136,12 @@ class DatasetWriter:
                 before.episodes + i,
                 episode.length,
                 episode.first,
-                episode.data_file,
+                data_file,
                 self._task,
             )
-            for i, episode in enumerate(block.episodes)
+            for i, (episode, data_file) in enumerate(
+                zip(block.episodes, block.data_files, strict=True)
+            )
         ]
         after = _Published(
             before.episodes + len(rows),
@@ -183,30 +181,63 @@ class _Block:
 
     Args:
         data_file: Number of its first data file.
+
+    Attributes:
+        waiting: Episodes that are not written yet, each with its columns.
+        episodes: Those that are.
+        data_files: Number of the data file of each.
+        torn: Rows were written that are not listed.
     """
 
     def __init__(self, data_file: int) -> None:
         self.data_file = data_file
+        self.waiting: list[tuple[_Episode, files.Columns]] = []
         self.episodes: list[_Episode] = []
-        self.frames = 0
+        self.data_files: list[int] = []
         self.torn = False
         self._writer: pq.ParquetWriter | None = None
         self._path = Path()
         self._frames_in_file = 0
 
-    def write(self, stage: Path, table: Any) -> None:
+    @property
+    def size(self) -> int:
+        """Episodes, written or waiting."""
+        return len(self.episodes) + len(self.waiting)
+
+    @property
+    def frames(self) -> int:
+        """Their frames."""
+        return sum(e.length for e in (*self.episodes, *(e for e, _ in self.waiting)))
+
+    def write(self, stage: Path, schema: pa.Schema) -> None:
+        """Writes the episodes that wait."""
+        if not self.waiting:
+            return
+        table = files.data_table(schema, [columns for _, columns in self.waiting])
+        # An interrupt in here would leave rows that are not listed.
+        self.torn = True
+        row = 0
+        for episode, _ in self.waiting:
+            self._write_rows(stage, table.slice(row, episode.length))
+            self.data_files.append(self.data_file)
+            row += episode.length
+        self.episodes += [episode for episode, _ in self.waiting]
+        self.waiting = []
+        self.torn = False
+
+    def _write_rows(self, stage: Path, rows: pa.Table) -> None:
         """Appends the rows of an episode, to a new file where LeRobot would begin one."""
         if self._writer is not None:
             size = self._path.stat().st_size / 2**20
-            if size * (1.0 + len(table) / self._frames_in_file) >= files.DATA_FILE_MB:
+            if size * (1.0 + len(rows) / self._frames_in_file) >= files.DATA_FILE_MB:
                 self.close()
                 self.data_file += 1
         if self._writer is None:
             self._path = stage / files.numbered(files.DATA, self.data_file)
-            self._writer = files.data_writer(self._path, table.schema)
+            self._writer = files.data_writer(self._path, rows.schema)
             self._frames_in_file = 0
-        self._writer.write_table(table)
-        self._frames_in_file += len(table)
+        self._writer.write_table(rows)
+        self._frames_in_file += len(rows)
 
     def close(self) -> None:
         """Writes the footer."""

@@ -90,7 +90,9 @@ def _picture(task: "Align", name: str, bank: npt.NDArray[np.int16] | None) -> An
             physics.data.ptr, task.cameras[name].id, side, side
         )
         if bank is not None:
-            random = task.source.generator(f"noise-{name}", task.scenario.index, task.steps)
+            random = task.source.generator(
+                f"noise-{name}", task.scenario.index, task.environment.control_steps
+            )
             start = int(random.integers(bank.size - image.size))
             noise = bank[start : start + image.size].reshape(image.shape)
             image = np.clip(image + noise, 0, 255).astype(np.uint8)

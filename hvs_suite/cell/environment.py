@@ -12,7 +12,9 @@ What differs from ``composer.Environment``, and why:
 """
 
 import abc
+import dataclasses
 import weakref
+from collections.abc import Sequence
 from typing import Any, Self
 
 import dm_env
@@ -22,6 +24,7 @@ import numpy.typing as npt
 from dm_control import composer, mjcf
 from dm_env import specs
 
+from hvs_suite.cell.cameras import CameraImage
 from hvs_suite.cell.renderer import Renderer
 from hvs_suite.errors import ScenarioError
 
@@ -70,6 +73,19 @@ class ServoTask(composer.Task, abc.ABC):
         """Whether the last control step ended the episode."""
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Moment:
+    """All that changes in a scene during an episode.
+
+    Attributes:
+        steps: Control steps since the reset.
+        qpos: Joint positions of the model (rad).
+    """
+
+    steps: int
+    qpos: FloatArray
+
+
 class Environment(composer.Environment):
     """A ``composer.Environment`` whose episodes are scenarios with an index.
 
@@ -77,8 +93,8 @@ class Environment(composer.Environment):
         clip_actions: Clip and count action values outside [-1, 1] instead of refusing them.
         goal_ends_episode: False lets an episode go on past its goal to the time limit, so that one
             can see where a policy settles. Never changes a scene.
-        observes_end: False leaves the observation of an episode's last time step empty, for those
-            who look only at what they act on. Never changes a scene.
+        draws: False leaves pictures out of the time steps, for those who do without or have
+            ``pictures`` draw them later. Never changes a scene.
 
     Args:
         task: The task.
@@ -88,7 +104,7 @@ class Environment(composer.Environment):
     def __init__(self, task: ServoTask, seed: int | None = None) -> None:
         self.clip_actions = False
         self.goal_ends_episode = True
-        self.observes_end = True
+        self.draws = True
         self._physics: Any = None
         self._renderer: Renderer | None = None
         self._studio: dict[int, Renderer] = {}
@@ -170,8 +186,7 @@ class Environment(composer.Environment):
         discount = task.get_discount(physics)
         self._reset_next_step = task.has_ended
         kind = dm_env.StepType.LAST if task.has_ended else dm_env.StepType.MID
-        seen = {} if task.has_ended and not self.observes_end else self._observe()
-        return dm_env.TimeStep(kind, reward, discount, seen)
+        return dm_env.TimeStep(kind, reward, discount, self._observe())
 
     def observation_spec(self) -> dict[str, specs.Array]:
         """Shapes, types and bounds of the observations, known without drawing anything."""
@@ -301,12 +316,48 @@ class Environment(composer.Environment):
         view = self.task.view(self._physics_proxy, camera)
         return self._studio[side].colour(self._physics.data.ptr, view, height, width)
 
+    def moment(self) -> Moment:
+        """What ``pictures`` needs to know of the present."""
+        return Moment(self._control_steps, self._physics.data.ptr.qpos.copy())
+
+    def pictures(self, moments: Sequence[Moment]) -> dict[str, list[npt.NDArray[Any]]]:
+        """Draw what the cameras showed at moments of this episode, exactly as observed then.
+
+        Who acts without looking gains by drawing later: an episode's pictures in one go take less
+        time than between physics and decisions, and so do those.
+
+        Args:
+            moments: Of ``moment``, since the last reset.
+
+        Returns:
+            Observed pictures by name, one a moment; the environment is left as it was.
+        """
+        model, data = self._physics.model.ptr, self._physics.data.ptr
+        cameras = {
+            name: item
+            for name, item in self.task.observables.items()
+            if item.enabled and isinstance(item, CameraImage)
+        }
+        drawn: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in cameras}
+        present = self.moment()
+        try:
+            for moment in moments:
+                self._control_steps, data.qpos[:] = moment.steps, moment.qpos
+                mujoco.mj_kinematics(model, data)
+                mujoco.mj_camlight(model, data)
+                for name, item in cameras.items():
+                    drawn[name].append(item(self._physics_proxy, self._random_state))
+        finally:
+            self._control_steps, data.qpos[:] = present.steps, present.qpos
+            mujoco.mj_step1(model, data)
+        return drawn
+
     def _observe(self) -> Observation:
         physics, random_state = self._physics_proxy, self._random_state
         return {
             name: item(physics, random_state)
             for name, item in self.task.observables.items()
-            if item.enabled
+            if item.enabled and (self.draws or not isinstance(item, CameraImage))
         }
 
     def _upload_textures(self) -> None:

@@ -200,19 +200,27 @@ def test_a_reset_rebuilds_nothing_and_each_camera_is_drawn_once_a_step(
             assert drawn == 2 * cameras
 
 
-def test_what_the_last_step_shows_can_be_left_out_and_nothing_else_changes() -> None:
-    with hvs_suite.load("align-thesis", time_limit_steps=3) as env:
-        whole = [env.reset(scenario=0), *(env.step(wander(env, i)) for i in range(3))]
-        env.observes_end = False
-        spared = [env.reset(scenario=0), *(env.step(wander(env, i)) for i in range(3))]
-        assert env.reset(scenario=1).observation
-    assert spared[-1].observation == {}
-    assert [step._replace(observation=None) for step in spared] == [
-        step._replace(observation=None) for step in whole
-    ]
-    for one, other in zip(whole[:-1], spared[:-1], strict=True):
+@pytest.mark.parametrize("task", hvs_suite.TASKS)
+def test_pictures_drawn_later_are_those_that_were_observed(task: str) -> None:
+    with hvs_suite.load(task, image_noise=3.0) as env:
+        seen = [env.reset(scenario=0), *(env.step(wander(env, i)) for i in range(3))]
+        env.draws = False
+        blind = [env.reset(scenario=0)]
+        moments = [env.moment()]
+        for i in range(3):
+            blind.append(env.step(wander(env, i)))
+            moments.append(env.moment())
+        before = env.moment(), env.physics.get_state(), env.physics.data.xpos.copy()
+        pictures = env.pictures(moments)
+        assert env.control_steps == before[0].steps
+        np.testing.assert_array_equal(env.physics.get_state(), before[1])
+        np.testing.assert_array_equal(env.physics.data.xpos, before[2])
+    for i, (one, other) in enumerate(zip(seen, blind, strict=True)):
+        assert one._replace(observation=None) == other._replace(observation=None)
+        assert one.observation.keys() == {*other.observation, *pictures}
+        drawn = {name: each[i] for name, each in pictures.items()}
         for name, value in one.observation.items():
-            np.testing.assert_array_equal(value, other.observation[name])
+            np.testing.assert_array_equal(value, {**other.observation, **drawn}[name])
 
 
 @pytest.mark.parametrize("task", hvs_suite.TASKS)

@@ -237,14 +237,16 @@ def test_a_data_file_ends_where_lerobot_would_end_it(features, episodes, tmp_pat
 
 def test_what_was_torn_by_an_interrupt_is_dropped(features, episodes, tmp_path, monkeypatch):
     root = tmp_path / "interrupted"
-    files = DatasetWriter(root, features, FPS, SENTENCE, 50)
+    files = DatasetWriter(root, features, FPS, SENTENCE, 2)
     files.save(packed(0, episodes[0], features, OUTCOME))
+    rows = pq.ParquetWriter.write_table
 
-    def interrupt(*_arguments):
+    def interrupt(*arguments):
+        rows(*arguments)
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(writer, "_Episode", interrupt)
+        patched.setattr(pq.ParquetWriter, "write_table", interrupt)
         with pytest.raises(KeyboardInterrupt):
             files.save(packed(1, episodes[1], features, OUTCOME))
     files.publish()
