@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from hvs_suite.errors import PolicyError
+from hvs_suite.policies.hvs.compiled import CompiledNetwork
 from hvs_suite.policies.hvs.network import (
     IMAGE_PREFIX,
     N_JOINTS,
@@ -283,20 +284,27 @@ def weights_digest(folder: Path) -> str:
 def _network(folder: Path, config: Mapping[str, Any]) -> tuple[Decide, Callable[[], None]]:
     """Play the network of an `hvs` checkpoint by itself."""
     network = load_network(folder, config)
+    if not network.shape.state_dim:
+        return lambda batch: network.to_action(network(*_one(network, batch)).out, None), _nothing
+    compiled = CompiledNetwork(network)
     memory: Tensor | None = None
 
     def decide(batch: dict[str, Tensor]) -> Tensor:
         nonlocal memory
         images, state = _one(network, batch)
-        decision = network(images, state, memory)
-        memory = decision.memory
-        return network.to_action(decision.out, state)
+        assert state is not None
+        action, memory = compiled(images, state, memory)
+        return action
 
     def forget() -> None:
         nonlocal memory
         memory = None
 
     return decide, forget
+
+
+def _nothing() -> None:
+    """Forget nothing: a policy without joints has no memory."""
 
 
 def _lerobot(folder: Path, instruction: str) -> tuple[Decide, Callable[[], None]]:

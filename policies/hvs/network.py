@@ -457,8 +457,7 @@ class HvsNetwork(nn.Module):
             has_seen = remembered[:, MEMORY_SIZE - 1 :: MEMORY_SIZE].amax(dim=1) > 0
             for sighting in sightings.values():
                 has_seen = has_seen | (sighting.visible_logit[:, 0] > -SEEN_LOGIT)
-            if not has_seen.all():
-                out = torch.where(has_seen[:, None], out, self._look_out(q))
+            out = torch.where(has_seen[:, None], out, self._look_out(q))
         out, known = self._with_residual(inputs, out)
         return Decision(out, known, sightings, target, remembered, motion)
 
@@ -557,8 +556,31 @@ class HvsNetwork(nn.Module):
         """
         if state is None:
             return out.clamp(-1.0, 1.0)
-        target = state[:, :N_JOINTS] + self.to_step(out)
-        target = geometry.lifted(target, self.lowest_goal - geometry.LEAST_HEIGHT_MARGIN_M)
+        target = self.to_target(out, state)
+        return self.within_bounds(target, geometry.flange_motion(target).position[:, 2:])
+
+    def to_target(self, out: Tensor, state: Tensor) -> Tensor:
+        """Joint angles that the head's output stands for, (B, 7) rad, bounds not looked at.
+
+        Args:
+            out: (B, 7).
+            state: As in `forward`.
+        """
+        return state[:, :N_JOINTS] + self.to_step(out)
+
+    def within_bounds(self, target: Tensor, height: Tensor) -> Tensor:
+        """The action that comes nearest to joint angles and keeps the bounds.
+
+        Args:
+            target: (B, 7) rad.
+            height: Of the flange there, (B, 1) m.
+
+        Returns:
+            As `to_action` does.
+        """
+        least = self.lowest_goal - geometry.LEAST_HEIGHT_MARGIN_M
+        if (height < least).any():
+            target = geometry.lifted(target, least)
         return (target / self.joint_range).clamp(-1.0, 1.0)
 
     def to_step(self, out: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ import torch
 from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.cell.robot import JOINT_RANGE_RAD
 from hvs_suite.policies.hvs import geometry
+from hvs_suite.policies.hvs.compiled import CompiledNetwork
 from hvs_suite.policies.hvs.network import (
     FEATURE_SIZE,
     HvsNetwork,
@@ -181,6 +182,31 @@ def test_no_action_sends_the_flange_below_where_goals_lie():
     assert (geometry.flange_motion(q + step).position[:3, 2] < 0.0).all()
     assert heights[:3].tolist() == pytest.approx([0.04] * 3, abs=2e-3)
     assert heights[3].item() == pytest.approx(0.084, abs=1e-3)
+
+
+@pytest.mark.parametrize("state_dim", [7, 14])
+@pytest.mark.parametrize("names", [("eih",), ("eth",), ("eih", "eth")])
+def test_compiled_the_network_decides_as_before(names, state_dim):
+    cameras = {name: CAMERAS[name] for name in names}
+    net = network(cameras, state_dim).eval()
+    images, state = inputs(cameras, state_dim, n=20)
+    assert state is not None
+    state[:, [1, 3, 5]] += torch.tensor([0.6, -1.4, 1.1])
+    # Half of the postures are too low, so that both ways out are taken.
+    net.lowest_goal.copy_(geometry.flange_motion(state[:, :7]).position[:, 2].median())
+    compiled, memory = CompiledNetwork(net), None
+    raised = []
+    with torch.inference_mode():
+        for i in range(len(state)):
+            seen = {name: image[i : i + 1] for name, image in images.items()}
+            decision = net(seen, state[i : i + 1], memory)
+            expected = net.to_action(decision.out, state[i : i + 1])
+            action, memory = compiled(seen, state[i : i + 1], memory)
+            torch.testing.assert_close(action, expected, atol=1e-6, rtol=0.0)
+            torch.testing.assert_close(memory, decision.memory, atol=1e-6, rtol=0.0)
+            unbounded = net.to_target(decision.out, state[i : i + 1]) / net.joint_range
+            raised.append(not torch.allclose(expected, unbounded.clamp(-1.0, 1.0), atol=1e-5))
+    assert 0 < sum(raised) < len(raised)
 
 
 def test_a_few_images_are_learned_by_heart():

@@ -1,0 +1,81 @@
+"""The network compiled for playing: one observation at a time, on one core.
+
+Called operation by operation from Python, a decision is some two thousand calls, and what takes the
+time is not the sums but getting to them, all the more where the renderer has just swept the caches.
+Traced once and frozen, it is one call of some six hundred.
+"""
+
+import warnings
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from hvs_suite.policies.hvs import geometry
+from hvs_suite.policies.hvs.network import MEMORY_SIZE, HvsNetwork
+
+# TorchScript looks at what it runs before it settles how.
+_WARM_UP_CALLS = 3
+
+
+class CompiledNetwork:
+    """Plays an `HvsNetwork` that reads joints.
+
+    Args:
+        network: In evaluation mode; later changes of its weights are not noticed.
+    """
+
+    def __init__(self, network: HvsNetwork) -> None:
+        self._network = network
+        shape = network.shape
+        images = tuple(torch.zeros(1, *(c, side, side)) for c, side in shape.cameras.values())
+        state = torch.zeros(1, shape.state_dim)
+        self._nothing = torch.zeros(1, MEMORY_SIZE * len(images))
+        with torch.no_grad(), warnings.catch_warnings():
+            # Tracing holds for batches of one alone, which is all it is made for; and newer Python
+            # will want another compiler, which needs a C++ one installed.
+            warnings.simplefilter("ignore")
+            traced = torch.jit.trace(  # type: ignore[no-untyped-call]
+                _Commands(network).eval(), (images, state, self._nothing), check_trace=False
+            )
+            # Not optimize_for_inference: its convolutions take twice as long on larger images.
+            self._commands = torch.jit.freeze(traced)
+            for _ in range(_WARM_UP_CALLS):
+                self._commands(images, state, self._nothing)
+
+    def __call__(
+        self, images: Mapping[str, Tensor], state: Tensor, memory: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Decide, as `HvsNetwork.forward` and `HvsNetwork.to_action` do together.
+
+        Args:
+            images: Camera name to (1, C, H, W), float in [0, 1].
+            state: Measured joints, (1, 14) or (1, 7).
+            memory: What the last call returned, or None at the start of an episode.
+
+        Returns:
+            Joint position targets in units of the joint range, (1, 7) in [-1, 1], and the memory
+            (1, 4 n) for the next call.
+        """
+        seen = tuple(images[name] for name in self._network.shape.cameras)
+        target, height, memory = self._commands(
+            seen, state, self._nothing if memory is None else memory
+        )
+        return self._network.within_bounds(target, height), memory
+
+
+class _Commands(nn.Module):
+    """What of a decision holds no branch."""
+
+    def __init__(self, network: HvsNetwork) -> None:
+        super().__init__()
+        self._network = network
+
+    def forward(
+        self, images: tuple[Tensor, ...], state: Tensor, memory: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Where to send the joints, how high that is, and the next memory."""
+        named = dict(zip(self._network.shape.cameras, images, strict=True))
+        decision = self._network(named, state, memory)
+        target = self._network.to_target(decision.out, state)
+        return target, geometry.flange_motion(target).position[:, 2:], decision.memory
