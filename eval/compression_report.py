@@ -156,9 +156,10 @@ def _rule(axes: Any, height: float, size: float, words: str = LOSSLESS) -> None:
     axes.axhline(height, color=REFERENCE, linewidth=1.0, linestyle="--", label=LOSSLESS)
     axes.axvline(size, color=REFERENCE, linewidth=1.0, linestyle=":")
     if words != LOSSLESS:
+        # Beside the upright line, where few settings come.
         axes.annotate(
-            words, (0.0, height), xycoords=("axes fraction", "data"), xytext=(4, 3),
-            textcoords="offset points", fontsize=7.5, color=REFERENCE,
+            words, (size, height), xytext=(-4, 3), textcoords="offset points", fontsize=7.5,
+            color=REFERENCE, ha="right",
         )  # fmt: skip
 
 

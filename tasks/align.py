@@ -72,13 +72,7 @@ class Align(ServoTask):
             )
         self.set_timesteps(control_timestep=variant.control_period_s, physics_timestep=timestep)
         self._observables = observations.make_observables(self)
-        bounds = {
-            "position_error_mm": variant.position_tolerance_mm,
-            "lateral_error_mm": variant.lateral_tolerance_mm,
-            "height_error_mm": variant.height_tolerance_mm,
-            "tilt_error_deg": variant.tilt_tolerance_deg,
-        }
-        self._tolerances = tuple((n, bound) for n, bound in bounds.items() if bound is not None)
+        self._tolerances = variant.tolerances
         self._scenario: Scenario | None = None
         self._goal_configurations: FloatArray | None = None
         self._errors: dict[str, float] = {}
@@ -271,7 +265,7 @@ class Align(ServoTask):
     @property
     def is_inside(self) -> bool:
         """Whether all errors lie within the tolerances now."""
-        return all(abs(self._errors[name]) <= bound for name, bound in self._tolerances)
+        return all(abs(self._errors[name]) <= bound for name, bound in self._tolerances.items())
 
     @property
     def reward_terms(self) -> dict[str, float]:

@@ -201,10 +201,20 @@ class AlignVariant:
             raise OptionError("eth_position_m lies straight above eth_look_at_m; shift one of them")
 
     @property
+    def tolerances(self) -> dict[str, float]:
+        """Errors that are bounded, by their name in ``info``: mm, and deg of tilt."""
+        bounds = {
+            "position_error_mm": self.position_tolerance_mm,
+            "lateral_error_mm": self.lateral_tolerance_mm,
+            "height_error_mm": self.height_tolerance_mm,
+            "tilt_error_deg": self.tilt_tolerance_deg,
+        }
+        return {name: bound for name, bound in bounds.items() if bound is not None}
+
+    @property
     def tightest_tolerance_mm(self) -> float:
         """Smallest of the bounds on the position (mm)."""
-        bounds = (self.position_tolerance_mm, self.lateral_tolerance_mm, self.height_tolerance_mm)
-        return min(bound for bound in bounds if bound is not None)
+        return min(bound for name, bound in self.tolerances.items() if name.endswith("_mm"))
 
     @property
     def instruction(self) -> str:

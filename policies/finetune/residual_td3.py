@@ -19,6 +19,7 @@ from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.td3.policies import Actor, MultiInputPolicy
 from torch import Tensor, nn
 
+from hvs_suite.policies.finetune.outlook import OUTLOOK_SIZE, Outlook
 from hvs_suite.policies.finetune.stage import FEATURES, PRIVILEGED
 from hvs_suite.policies.hvs.network import N_JOINTS, make_residual, normed_layers
 
@@ -48,8 +49,33 @@ class Keys(BaseFeaturesExtractor):
         return torch.cat([observations[key] for key in self._keys], dim=1)
 
 
+class ForesightedCritic(ContinuousCritic):
+    """Critics that also read what the action leads to.
+
+    Attributes:
+        outlook: Reckons that.
+    """
+
+    outlook: Outlook
+
+    def forward(self, obs: Any, actions: Tensor) -> tuple[Tensor, ...]:
+        """Values of all critics, (B, 1) each; SB3's interface."""
+        ahead = self.outlook(obs[FEATURES], obs[PRIVILEGED], actions)
+        inputs = torch.cat([obs[FEATURES], obs[PRIVILEGED], ahead, actions], dim=1)
+        return tuple(network(inputs) for network in self.q_networks)
+
+
 class ResidualPolicy(MultiInputPolicy):
-    """Actor on the features alone, critics on features, privileged state and action."""
+    """Actor on the features alone, critics on features, privileged state and action.
+
+    Args:
+        outlook: What critics read of an action.
+        arguments: Of SB3's policy.
+    """
+
+    def __init__(self, *arguments: Any, outlook: Outlook, **named: Any) -> None:
+        self.outlook = outlook
+        super().__init__(*arguments, **named)
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         """An actor that says nothing at first; SB3's interface."""
@@ -65,8 +91,9 @@ class ResidualPolicy(MultiInputPolicy):
         """An ensemble of critics; SB3's interface."""
         del features_extractor
         keys = Keys(self._dict_space(), (FEATURES, PRIVILEGED))
-        critic = ContinuousCritic(**{**self.critic_kwargs, **_extracted(keys)})
-        n_inputs, [hidden, *_] = keys.features_dim + N_JOINTS, self.actor.net_arch
+        critic = ForesightedCritic(**{**self.critic_kwargs, **_extracted(keys)})
+        critic.outlook = self.outlook
+        n_inputs, [hidden, *_] = keys.features_dim + OUTLOOK_SIZE + N_JOINTS, self.actor.net_arch
         critic.q_networks = [
             nn.Sequential(*normed_layers(n_inputs, hidden), nn.Linear(hidden, 1))
             for _ in critic.q_networks

@@ -45,7 +45,7 @@ class Settings:
     tau: float = 0.005
     gamma: float = 0.97
     replay_size: int = 200_000
-    warm_up_steps: int = 5_000
+    warm_up_steps: int = 2_000
     collect_steps: int = 40
     updates: int = 20
     noise: float = 0.2

@@ -26,7 +26,7 @@ FEATURES = "features"
 """Key of what the actor reads: `Decision.features` of the base."""
 PRIVILEGED = "privileged"
 """Key of what only the critics read, see `privileged_state`."""
-PRIVILEGED_SIZE = 26
+PRIVILEGED_SIZE = 32
 
 Observation = dict[str, npt.NDArray[np.float32]]
 
@@ -39,9 +39,9 @@ def privileged_state(environment: Any, error_scale: float) -> npt.NDArray[np.flo
         error_scale: Of the network (m); errors are read as asinh(x / this).
 
     Returns:
-        (26,): true joint positions and velocities in units of their limits, the way left to the
+        (32,): true joint positions and velocities in units of their limits, the way left to the
         goal in the base frame, the rotation vector from flange axis to inward normal, what is left
-        of the time, steps held, and both cameras' targets.
+        of the time, steps held, both cameras' targets, and the goal's place (m) and normal.
     """
     truth, info, variant = environment.privileged(), environment.info, environment.variant
     rotation, position = kinematics().flange_pose(truth["joint_positions"])
@@ -57,6 +57,8 @@ def privileged_state(environment: Any, error_scale: float) -> npt.NDArray[np.flo
             [left, info["n_inside"] / variant.hold_steps],
             truth["target_eih"][[2, 3]],
             truth["target_eth"][[2, 3]],
+            truth["goal_position"],
+            truth["goal_normal"],
         ]
     ).astype(np.float32)
 
@@ -69,8 +71,8 @@ class ResidualStage(gymnasium.Wrapper[Any, Any, Any, Any]):
     the logarithmic scale that joint steps are learned in. The action zero plays the base policy.
 
     The reward is the task's, and a potential beside it that changes no best policy (Ng, Harada and
-    Russell, 1999): gamma * phi(s') - phi(s), with phi(s) = -weight * asinh(error / tolerance), and
-    0 at the end of an episode.
+    Russell, 1999): gamma * phi(s') - phi(s), with phi(s) = -weight * sum of asinh(error /
+    tolerance) over the errors that the task bounds, and 0 at the end of an episode.
 
     Args:
         env: An `hvs_suite.gym.AlignEnv`.
@@ -95,7 +97,7 @@ class ResidualStage(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._shaping = shaping
         self._gamma = gamma
         self._environment: Any = env.unwrapped.environment  # type: ignore[attr-defined]
-        self._tolerance_mm = self._environment.variant.tightest_tolerance_mm
+        self._tolerances = self._environment.variant.tolerances
         self._memory: torch.Tensor | None = None
         self._decision: Decision | None = None
         self._state: torch.Tensor | None = None
@@ -130,7 +132,8 @@ class ResidualStage(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self._look(observation), reward, terminated, truncated, info
 
     def _phi(self, info: Mapping[str, Any]) -> float:
-        return -self._shaping * float(np.arcsinh(info["position_error_mm"] / self._tolerance_mm))
+        errors = [info[name] / bound for name, bound in self._tolerances.items()]
+        return -self._shaping * float(np.arcsinh(errors).sum())
 
     def _look(self, observation: Mapping[str, npt.NDArray[Any]]) -> Observation:
         with one_torch_thread(), torch.inference_mode():

@@ -31,10 +31,11 @@ from hvs_suite.policies.checkpoint import (
 )
 from hvs_suite.policies.finetune.eyes import train_eyes
 from hvs_suite.policies.finetune.folding import load_base, with_residual, write_folded
+from hvs_suite.policies.finetune.outlook import Outlook
 from hvs_suite.policies.finetune.residual_td3 import ResidualPolicy, ResidualTD3
 from hvs_suite.policies.finetune.settings import Settings
 from hvs_suite.policies.finetune.stage import ResidualStage
-from hvs_suite.policies.hvs.network import N_JOINTS
+from hvs_suite.policies.hvs.network import N_JOINTS, HvsNetwork
 from hvs_suite.policies.rl.curriculum import Curriculum, Kind, levels_of
 from hvs_suite.policies.rl.evaluation import Evaluation, Examiner
 from hvs_suite.policies.rl.journal import OUTCOMES, Journal
@@ -143,7 +144,8 @@ def finetune(
         )
         environments = _environments(MakeStage(task, options, levels, split, base, settings, seed))
         stack.callback(environments.close)
-        learner = _Finetuned(_make_model(environments, settings, seed), base, out, variant)
+        model = _make_model(environments, load_base(base), settings, seed)
+        learner = _Finetuned(model, base, out, variant)
         run = Run(out, learner, examiner, on_progress)
         stack.callback(run.close)
         run.train(limit, settings.collect_steps, eval_every, checkpoint_period_s)
@@ -227,7 +229,9 @@ class _Finetuned:
             (self._out / f".{path.name}").replace(self._out / path.name)
 
 
-def _make_model(environments: VecEnv, settings: Settings, seed: int) -> ResidualTD3:
+def _make_model(
+    environments: VecEnv, base: HvsNetwork, settings: Settings, seed: int
+) -> ResidualTD3:
     sigma = np.full(N_JOINTS, settings.noise)
     model = ResidualTD3(
         ResidualPolicy,
@@ -246,7 +250,11 @@ def _make_model(environments: VecEnv, settings: Settings, seed: int) -> Residual
         replay_buffer_kwargs={"handle_timeout_termination": False},
         target_policy_noise=settings.target_noise,
         target_noise_clip=2.0 * settings.target_noise,
-        policy_kwargs={"net_arch": [settings.hidden], "n_critics": settings.critics},
+        policy_kwargs={
+            "net_arch": [settings.hidden],
+            "n_critics": settings.critics,
+            "outlook": Outlook(base, settings.bound),
+        },
         seed=seed,
         device="cpu",
     )

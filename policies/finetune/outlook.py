@@ -1,0 +1,58 @@
+"""What a command leads to, by the arm's own kinematics: what a critic need not learn.
+
+The worth of a command lies in millimetres at the end of a metre of arm. The kinematics of seven
+joints at that precision are more than a critic learns in an hour, and the actor can be no better
+than the critic's slope. So critics read the errors that a command leads to, and their slope comes
+through the kinematics.
+"""
+
+import torch
+from torch import Tensor
+
+from hvs_suite.policies.hvs import geometry
+from hvs_suite.policies.hvs.network import CONTROL_PERIOD_S, N_JOINTS, HvsNetwork
+
+OUTLOOK_SIZE = 10
+FINE = 25.0
+"""Lengths are also read on a scale that is finer by this factor: inside the tolerance."""
+
+
+class Outlook:
+    """Errors after a control step that brings the joints where they are told to go.
+
+    Args:
+        network: The base.
+        bound: The most that an action of 1 adds to its output.
+    """
+
+    def __init__(self, network: HvsNetwork, bound: float) -> None:
+        self._scale = network.shape.error_scale
+        self._bound = bound
+        self._joint_range = network.joint_range
+        self._longest_step = network.joint_speed * CONTROL_PERIOD_S
+
+    def __call__(self, features: Tensor, privileged: Tensor, action: Tensor) -> Tensor:
+        """Look ahead.
+
+        Args:
+            features: `Decision.features` of the base, which end in its output, (B, n).
+            privileged: As `privileged_state` gives it, (B, m).
+            action: Shares of the bound, (B, 7).
+
+        Returns:
+            (B, 10), each as asinh(x / error scale): from flange to goal (3), the rotation vector
+            from flange axis to inward normal (3), and the length of either, also on a finer scale.
+        """
+        joints = privileged[:, :N_JOINTS] * self._joint_range
+        goal, normal = privileged[:, -6:-3], privileged[:, -3:]
+        out = features[:, -N_JOINTS:] + self._bound * action
+        longest = self._longest_step
+        # Nothing larger than the first bound is meant, and its sinh would overflow.
+        step = (self._scale * torch.sinh(out.clamp(-8.0, 8.0))).clamp(-longest, longest)
+        motion = geometry.flange_motion(joints + step)
+        way = goal - motion.position
+        turn = torch.linalg.cross(motion.rotation[:, :, 2], -normal, dim=1)
+        # Where the length is 0 the norm has no slope.
+        lengths = [(each.square().sum(dim=1, keepdim=True) + 1e-12).sqrt() for each in (way, turn)]
+        errors = torch.cat([way, turn, *lengths, *(FINE * length for length in lengths)], dim=1)
+        return torch.asinh(errors / self._scale)
