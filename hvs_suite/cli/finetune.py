@@ -50,7 +50,7 @@ class Finetune:
     eye_rounds: int = 2
     eye_frames: int = 6_000
     eye_steps: int = 1_000
-    warm_up_steps: int = 5_000
+    warm_up_steps: int = 2_000
     bound: float = 0.6
     noise: float = 0.2
     actor_rate: float = 1e-4
