@@ -38,6 +38,7 @@ def draw_run(out: Path) -> Path:
         OutputError: It cannot be written.
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogFormatter
 
     curves = read_curves(out / "training" / "tensorboard")
     rounds = _rounds(out / "training" / "dagger")
@@ -49,9 +50,14 @@ def draw_run(out: Path) -> Path:
     parts.set_title("its parts, in training")
     for axes in (whole, parts):
         axes.set(xlabel="optimiser step", yscale="log")
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.5)))
         axes.grid(alpha=0.3)
         if axes.lines:
-            axes.legend(frameon=False, fontsize=8)
+            # Below the curves, which leave no corner free.
+            axes.legend(
+                frameon=False, fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.18)
+            )
     _draw_rounds(played, rounds)
     target = out / "training" / PICTURE
     with replacing(target) as temporary:
