@@ -29,6 +29,8 @@ class Share:
         video: Share a copy whose images are videos: much smaller, and lossy.
         codec: Encoder of the videos.
         crf: Constant rate factor of the videos; lower is better and larger.
+        pixel_format: yuv420p keeps a colour for four pixels, as LeRobot has it; yuv444p one for
+            each, without which small targets are lost (docs/experiments/compression.md), with h264.
         licence: Identifier of the dataset's licence.
         workers: Processes that check.
     """
@@ -40,6 +42,7 @@ class Share:
     video: bool = False
     codec: Literal["libsvtav1", "h264"] = "libsvtav1"
     crf: int = 30
+    pixel_format: Literal["yuv420p", "yuv444p"] = "yuv420p"
     licence: str = "apache-2.0"
     workers: int = 1
 
@@ -77,7 +80,7 @@ class Share:
 
         with tempfile.TemporaryDirectory(prefix="hvs-share-") as folder:
             out = Path(folder) / self.data.resolve().name
-            convert_to_video(self.data, out, Encoding(self.codec, self.crf))
+            convert_to_video(self.data, out, Encoding(self.codec, self.crf, self.pixel_format))
             self._refuse_damage(out)
             yield out
 

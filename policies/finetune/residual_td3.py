@@ -24,6 +24,10 @@ from hvs_suite.policies.finetune.stage import FEATURES, PRIVILEGED
 from hvs_suite.policies.hvs.network import N_JOINTS, make_residual, normed_layers
 
 N_TARGET_CRITICS = 2
+WARM_UP_UPDATES = 4
+"""While the critics learn alone, this many times as many updates. What a scene is worth in the end
+has to come all the way to its beginning before the actor can trust them; on values that still rise
+everywhere, it learned to dawdle."""
 
 
 class Keys(BaseFeaturesExtractor):
@@ -131,7 +135,7 @@ class ResidualTD3(TD3):
         assert self.replay_buffer is not None
         frees_actor = self.num_timesteps >= self.warm_up_steps
         critic_losses, actor_losses, sizes, values = [], [], [], []
-        for _ in range(gradient_steps):
+        for _ in range(gradient_steps if frees_actor else WARM_UP_UPDATES * gradient_steps):
             self._n_updates += 1
             data: Any = self.replay_buffer.sample(batch_size)
             with torch.no_grad():

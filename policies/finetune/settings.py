@@ -42,7 +42,7 @@ class Settings:
     actor_rate: float = 1e-4
     critic_rate: float = 3e-4
     batch_size: int = 256
-    tau: float = 0.005
+    tau: float = 0.02
     gamma: float = 0.97
     replay_size: int = 200_000
     warm_up_steps: int = 2_000

@@ -254,6 +254,7 @@ def _make_model(
             "net_arch": [settings.hidden],
             "n_critics": settings.critics,
             "outlook": Outlook(base, settings.bound),
+            "optimizer_kwargs": {"fused": True},
         },
         seed=seed,
         device="cpu",

@@ -168,17 +168,25 @@ def test_a_hub_that_refuses_is_one_line(tmp_path):
     assert TOKEN not in done.stdout + done.stderr
 
 
-def test_a_shared_video_copy_is_sound_and_smaller(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("codec", "pixel_format", "named"),
+    [("libsvtav1", "yuv420p", "av1"), ("h264", "yuv444p", "h264")],
+)
+def test_a_shared_video_copy_is_sound_and_smaller(
+    codec, pixel_format, named, tmp_path, monkeypatch
+):
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     root = tmp_path / "sample"
     shutil.copytree(SAMPLE, root)
     archive = tmp_path / "video.tar"
-    assert run(["share", str(root), "--to-archive", str(archive), "--video", "--crf", "20"]) == 0
+    how = ["--video", "--codec", codec, "--crf", "20", "--pixel-format", pixel_format]
+    assert run(["share", str(root), "--to-archive", str(archive), *how]) == 0
     unpack(archive, tmp_path / "video")
     features = info_of(tmp_path / "video")["features"]
     assert features["observation.images.eih"]["dtype"] == "video"
+    assert features["observation.images.eih"]["info"]["video.pix_fmt"] == pixel_format
     assert len(list((tmp_path / "video" / "videos").rglob("*.mp4"))) == 2
-    assert "av1, lossy" in (tmp_path / "video" / "README.md").read_text()
+    assert f"{named}, lossy" in (tmp_path / "video" / "README.md").read_text()
     report = check_dataset(tmp_path / "video")
     assert [str(each) for each in report.damage] == []
     # The recording itself stays as it was.
