@@ -1,7 +1,7 @@
 """One demonstration: the expert plays a scenario, and every frame of it is kept.
 
-It leaves the worker that played it ready for the disk: pictures as PNG files, numbers by column,
-statistics taken. One process writes for all workers, so what is left to it bounds them all.
+It leaves the worker that played it ready for the disk: pictures as PNG files, their pixels counted,
+numbers by column. One process writes for all workers, so what is left to it bounds them all.
 """
 
 import contextlib
@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.cell.robot import JOINT_RANGE_RAD
-from hvs_suite.datasets.episode_stats import FeatureStats, column_stats, picture_stats
+from hvs_suite.datasets.episode_stats import Shades, picture_shades
 from hvs_suite.datasets.features import (
     Frame,
     acted_part,
@@ -49,7 +49,7 @@ class Demonstration:
         scenario: Index in the split.
         length: Control steps, one frame each.
         columns: The columns of :mod:`hvs_suite.datasets.features`: (n, k), or n PNG files.
-        stats: Statistics of each column.
+        shades: Pixels of each column of pictures, counted.
         success: The goal was reached.
         collision: A forbidden contact ended it.
     """
@@ -57,9 +57,20 @@ class Demonstration:
     scenario: int
     length: int
     columns: dict[str, npt.NDArray[Any] | list[bytes]]
-    stats: dict[str, FeatureStats]
+    shades: dict[str, Shades]
     success: bool
     collision: bool
+
+    @property
+    def numbers(self) -> dict[str, npt.NDArray[Any]]:
+        """The columns that hold no pictures."""
+        return {k: v for k, v in self.columns.items() if isinstance(v, np.ndarray)}
+
+    @property
+    def picture_bytes(self) -> int:
+        """Size of all PNG files."""
+        columns = self.columns.values()
+        return sum(sum(map(len, files)) for files in columns if isinstance(files, list))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,18 +158,17 @@ def packed(
         info: Of the environment, at the end of the episode.
     """
     columns: dict[str, npt.NDArray[Any] | list[bytes]] = {}
-    numbers: dict[str, npt.NDArray[Any]] = {}
     pictures: dict[str, list[npt.NDArray[np.uint8]]] = {}
     for name, feature in features.items():
         if feature["dtype"] == "image":
             pictures[name] = [frame[name] for frame in frames]
             columns[name] = encode(pictures[name])
         else:
-            columns[name] = numbers[name] = np.array([frame[name] for frame in frames])
+            columns[name] = np.array([frame[name] for frame in frames])
     with _one_thread():
-        stats = {**picture_stats(pictures), **column_stats(numbers)}
+        shades = picture_shades(pictures)
     return Demonstration(
-        scenario, len(frames), columns, stats, bool(info["is_success"]), bool(info["collision"])
+        scenario, len(frames), columns, shades, bool(info["is_success"]), bool(info["collision"])
     )
 
 

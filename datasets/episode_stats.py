@@ -89,22 +89,44 @@ def column_stats[Name](columns: Mapping[Name, npt.NDArray[Any]]) -> dict[Name, F
     return {name: stats[name] for name in columns}
 
 
-def picture_stats(
+@dataclasses.dataclass(frozen=True, eq=False)
+class Shades:
+    """The pixels of an episode's pictures that LeRobot samples, counted.
+
+    Attributes:
+        frames: Pictures that were counted.
+        counts: Pixels of each shade, (256, C).
+    """
+
+    frames: int
+    counts: npt.NDArray[np.int64]
+
+
+def picture_shades(
     features: Mapping[str, Sequence[npt.NDArray[np.uint8]]],
-) -> dict[str, FeatureStats]:
-    """Statistics by channel, in [0, 1], of the pixels that LeRobot samples.
+) -> dict[str, Shades]:
+    """Counts pixels; what needs the pictures themselves of ``shade_stats``.
 
     Args:
         features: Feature to pictures, uint8 (H, W, C) each, all of a feature alike in shape.
+    """
+    chosen = {name: sampled_pictures(pictures) for name, pictures in features.items()}
+    return {name: Shades(len(each), shade_counts(each)) for name, each in chosen.items()}
+
+
+def shade_stats[Name](features: Mapping[Name, Shades]) -> dict[Name, FeatureStats]:
+    """Statistics by channel, in [0, 1].
+
+    Args:
+        features: Feature to its counted pixels.
 
     Returns:
         Feature to statistics, in the order given.
     """
     if not features:
         return {}
-    chosen = {name: sampled_pictures(pictures) for name, pictures in features.items()}
-    # From here on channels of all features go through NumPy together, as columns do.
-    counts = np.concatenate([shade_counts(pictures) for pictures in chosen.values()], axis=1)
+    # Channels of all features go through NumPy together, as columns do.
+    counts = np.concatenate([each.counts for each in features.values()], axis=1)
     moments = Moments.of_shades(counts, 0)
     upto = np.cumsum(counts, axis=0)
     wanted = np.array(QUANTILES)[:, None] * upto[-1]
@@ -117,11 +139,11 @@ def picture_stats(
     quantiles = edges.within(edges.bins(shades.astype(np.float32)), (wanted - before) / inside)
     first = np.stack([moments.low, moments.high, moments.mean, np.sqrt(moments.variance)])
     values = np.concatenate([first, quantiles / 255.0])
-    ends = np.cumsum([pictures.shape[-1] for pictures in chosen.values()])
+    ends = np.cumsum([each.counts.shape[1] for each in features.values()])
     split = np.split(values, ends[:-1], axis=1)
     return {
-        name: FeatureStats(len(pictures), part)
-        for (name, pictures), part in zip(chosen.items(), split, strict=True)
+        name: FeatureStats(each.frames, part)
+        for (name, each), part in zip(features.items(), split, strict=True)
     }
 
 

@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from hvs_suite.datasets import lerobot_files, reader
 from hvs_suite.datasets.demonstration import Demonstration
-from hvs_suite.datasets.episode_stats import column_stats, picture_stats
+from hvs_suite.datasets.episode_stats import picture_shades
 from hvs_suite.datasets.features import SCENARIO
 from hvs_suite.datasets.metadata import METADATA_FILE
 from hvs_suite.datasets.png import encode
@@ -104,12 +104,11 @@ def _demonstration(
         if name not in pictures
     }
     images: dict[str, list[bytes]] = {name: encode(each) for name, each in pictures.items()}
-    stats = {**column_stats(numbers), **picture_stats(pictures)}
     return Demonstration(
         scenario=int(numbers[SCENARIO].ravel()[0]),
         length=table.num_rows,
         columns={**numbers, **images},
-        stats=stats,
+        shades=picture_shades(pictures),
         success=bool(numbers["next.success"].any()),
         collision=False,
     )

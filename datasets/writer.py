@@ -14,20 +14,27 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hvs_suite.datasets import lerobot_files as files
 from hvs_suite.datasets.demonstration import Demonstration
-from hvs_suite.datasets.episode_stats import FeatureStats, column_stats, merge_stats
+from hvs_suite.datasets.episode_stats import (
+    FeatureStats,
+    Shades,
+    column_stats,
+    merge_stats,
+    shade_stats,
+)
 from hvs_suite.datasets.features import ROBOT_TYPE
 from hvs_suite.errors import DatasetError, OutputError
 
 STAGE = ".recording"
 """Hidden folder inside the dataset that holds the block being written."""
-_WRITTEN_TOGETHER = 5
-"""Episodes that become one Arrow table: making one costs more than most episodes' numbers do."""
+_WAITING_BYTES = 2**23
+"""Pictures that wait for each other: making an Arrow table costs more than most episodes do."""
 _DATA_PLACE = ("data/chunk_index", "data/file_index")
 _EPISODE_PLACE = ("meta/episodes/chunk_index", "meta/episodes/file_index")
 # Counts come last: until then readers see the dataset as it was before the block.
@@ -60,14 +67,14 @@ class _Episode:
     Attributes:
         first: Index of its first frame in the dataset.
         length: Its frames.
-        counters: The columns that LeRobot adds.
-        stats: Statistics of all other columns.
+        numbers: Its columns of numbers, with those that LeRobot adds.
+        shades: Pixels of its pictures, counted.
     """
 
     first: int
     length: int
-    counters: Mapping[str, npt.NDArray[Any]]
-    stats: Mapping[str, FeatureStats]
+    numbers: Mapping[str, npt.NDArray[Any]]
+    shades: Mapping[str, Shades]
 
 
 class DatasetWriter:
@@ -98,6 +105,8 @@ class DatasetWriter:
         self._block = block
         self._published: _Published | None = None
         self._open: _Block | None = None
+        # PyArrow loads pandas at its first array, which had better not be amid the episodes.
+        pa.array(np.empty(0))
 
     def save(self, demonstration: Demonstration) -> None:
         """Appends one episode, and publishes the block when it is full.
@@ -113,11 +122,13 @@ class DatasetWriter:
         block, before = self._open, self._published
         length, first = demonstration.length, before.frames + block.frames
         counters = files.counters(length, before.episodes + block.size, first, self._fps)
-        episode = _Episode(first, length, counters, demonstration.stats)
+        numbers = {**demonstration.numbers, **counters}
+        episode = _Episode(first, length, numbers, demonstration.shades)
         block.waiting.append((episode, {**demonstration.columns, **counters}))
+        block.waiting_bytes += demonstration.picture_bytes
         if block.size >= self._block:
             self.publish()
-        elif len(block.waiting) >= _WRITTEN_TOGETHER:
+        elif block.waiting_bytes >= _WAITING_BYTES:
             block.write(self._stage, self._schema)
 
     def publish(self) -> None:
@@ -184,6 +195,7 @@ class _Block:
 
     Attributes:
         waiting: Episodes that are not written yet, each with its columns.
+        waiting_bytes: Size of their pictures.
         episodes: Those that are.
         data_files: Number of the data file of each.
         torn: Rows were written that are not listed.
@@ -192,6 +204,7 @@ class _Block:
     def __init__(self, data_file: int) -> None:
         self.data_file = data_file
         self.waiting: list[tuple[_Episode, files.Columns]] = []
+        self.waiting_bytes = 0
         self.episodes: list[_Episode] = []
         self.data_files: list[int] = []
         self.torn = False
@@ -222,7 +235,7 @@ class _Block:
             self.data_files.append(self.data_file)
             row += episode.length
         self.episodes += [episode for episode, _ in self.waiting]
-        self.waiting = []
+        self.waiting, self.waiting_bytes = [], 0
         self.torn = False
 
     def _write_rows(self, stage: Path, rows: pa.Table) -> None:
@@ -247,16 +260,17 @@ class _Block:
 
 
 def _stats_of_block(episodes: Sequence[_Episode]) -> list[dict[str, FeatureStats]]:
-    """Statistics of all columns, episode by episode."""
-    stats = [dict(episode.stats) for episode in episodes]
+    """Statistics of all columns, episode by episode; what is alike goes through NumPy together."""
+    shades = {(i, name): s for i, e in enumerate(episodes) for name, s in e.shades.items()}
+    found = shade_stats(shades)
     alike: dict[int, list[int]] = {}
     for i, episode in enumerate(episodes):
         alike.setdefault(episode.length, []).append(i)
-    # Counters of episodes of one length go through NumPy together.
     for members in alike.values():
-        together = {(i, name): c for i in members for name, c in episodes[i].counters.items()}
-        for (i, name), counted in column_stats(together).items():
-            stats[i][name] = counted
+        found |= column_stats({(i, n): v for i in members for n, v in episodes[i].numbers.items()})
+    stats: list[dict[str, FeatureStats]] = [{} for _ in episodes]
+    for (i, name), each in found.items():
+        stats[i][name] = each
     return stats
 
 

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from hvs_suite.policies.finetune.outlook import OUTLOOK_SIZE, Outlook
 from hvs_suite.policies.finetune.stage import FEATURES, PRIVILEGED
-from hvs_suite.policies.hvs.network import N_JOINTS, make_residual, normed_layers
+from hvs_suite.policies.hvs.network import make_residual, normed_layers
 
 N_TARGET_CRITICS = 2
 WARM_UP_UPDATES = 4
@@ -54,7 +54,7 @@ class Keys(BaseFeaturesExtractor):
 
 
 class ForesightedCritic(ContinuousCritic):
-    """Critics that also read what the action leads to.
+    """Critics that judge an action by where it leads, and by nothing else.
 
     Attributes:
         outlook: Reckons that.
@@ -65,7 +65,7 @@ class ForesightedCritic(ContinuousCritic):
     def forward(self, obs: Any, actions: Tensor) -> tuple[Tensor, ...]:
         """Values of all critics, (B, 1) each; SB3's interface."""
         ahead = self.outlook(obs[FEATURES], obs[PRIVILEGED], actions)
-        inputs = torch.cat([obs[FEATURES], obs[PRIVILEGED], ahead, actions], dim=1)
+        inputs = torch.cat([obs[FEATURES], obs[PRIVILEGED], ahead], dim=1)
         return tuple(network(inputs) for network in self.q_networks)
 
 
@@ -97,7 +97,7 @@ class ResidualPolicy(MultiInputPolicy):
         keys = Keys(self._dict_space(), (FEATURES, PRIVILEGED))
         critic = ForesightedCritic(**{**self.critic_kwargs, **_extracted(keys)})
         critic.outlook = self.outlook
-        n_inputs, [hidden, *_] = keys.features_dim + OUTLOOK_SIZE + N_JOINTS, self.actor.net_arch
+        n_inputs, [hidden, *_] = keys.features_dim + OUTLOOK_SIZE, self.actor.net_arch
         critic.q_networks = [
             nn.Sequential(*normed_layers(n_inputs, hidden), nn.Linear(hidden, 1))
             for _ in critic.q_networks

@@ -136,7 +136,7 @@ def test_resuming_after_a_kill_gives_the_same_dataset(dataset, tmp_path):
         "import os, signal\n"
         "from hvs_suite.datasets import writer\n"
         "from hvs_suite.datasets.recorder import record\n"
-        "writer._WRITTEN_TOGETHER = 1\n"
+        "writer._WAITING_BYTES = 0\n"
         f"def stop(p):\n    if p.episodes == 3: os.kill(os.getpid(), signal.SIGKILL)\n"
         f"record({TASK!r}, {N}, 'train', {str(root)!r}, block=2, progress=stop)\n"
     )
