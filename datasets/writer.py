@@ -33,7 +33,7 @@ from hvs_suite.errors import DatasetError, OutputError
 
 STAGE = ".recording"
 """Hidden folder inside the dataset that holds the block being written."""
-_WAITING_BYTES = 2**23
+_WAITING_BYTES = 2**20
 """Pictures that wait for each other: making an Arrow table costs more than most episodes do."""
 _DATA_PLACE = ("data/chunk_index", "data/file_index")
 _EPISODE_PLACE = ("meta/episodes/chunk_index", "meta/episodes/file_index")

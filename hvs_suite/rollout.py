@@ -31,6 +31,8 @@ from hvs_suite.errors import ActionError, HvsError, OptionError
 # read when the libraries load, hence set before a worker starts.
 WORKER_ENVIRONMENT = {"LP_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 WORKER_EXIT_TIMEOUT_S = 10.0
+_TOLD_AHEAD = 3
+"""Indices that a worker holds, the one it plays included."""
 
 Observation = Mapping[str, npt.NDArray[Any]]
 Action = npt.NDArray[np.float32]
@@ -218,8 +220,8 @@ def play[T](
     """Runs ``run(env, policy, scenario)`` over scenarios and yields results as they come.
 
     The general form of `rollout`, for callers that need more of an episode than an `Episode`
-    holds. Workers take the next index whenever they are free and run at most one result ahead
-    of the reader, so memory stays flat. Closing the iterator (or an error, or Ctrl-C) ends them.
+    holds. Workers take the next index whenever they are free and run a few results ahead of the
+    reader at most, so memory stays flat. Closing the iterator (or an error, or Ctrl-C) ends them.
 
     Args:
         make_env: Builds the environment, once a worker.
@@ -333,17 +335,16 @@ def _play_in_processes(job: _Job, scenarios: list[int], workers: int) -> Generat
                 started.append(_start_worker(job))
         processes = {connection: process for process, connection in started}
         waiting = iter(scenarios)
-        for connection in processes:
-            _send_next(connection, waiting)
-        remaining = len(scenarios)
-        while remaining:
-            for ready in wait(list(processes)):
+        # What each worker was told and has not answered: always some, so that it plays on while
+        # the caller looks at what it played before.
+        told = dict.fromkeys(processes, 0)
+        for connection in [*processes] * _TOLD_AHEAD:
+            told[connection] += _send_next(connection, waiting)
+        while busy := [connection for connection, count in told.items() if count]:
+            for ready in wait(busy):
                 connection = cast("Connection", ready)
                 result = _receive(connection, processes)
-                # The next index goes out first: the worker plays while the caller looks.
-                if not _send_next(connection, waiting):
-                    del processes[connection]
-                remaining -= 1
+                told[connection] += _send_next(connection, waiting) - 1
                 yield result
         for process, _ in started:
             process.join(WORKER_EXIT_TIMEOUT_S)
