@@ -21,7 +21,6 @@ from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.errors import ResultError
 from hvs_suite.eval import action_log, result_file
 from hvs_suite.eval.result_file import EpisodeRow
-from hvs_suite.eval.trial import tolerances
 from hvs_suite.policies.checkpoint import load_network, network_inputs, read_config
 from hvs_suite.rollout import Action, Observation, one_torch_thread
 from hvs_suite.tasks.variants import AlignVariant
@@ -206,7 +205,7 @@ def cause_of(
         estimate_error_mm: As in `Failure`.
         errors_mm: Position error at the start and after every step (mm).
     """
-    bounds = tolerances(variant)
+    bounds = variant.tolerances
     tolerance_mm = next(
         bounds[name] for name in ("position_error_mm", "lateral_error_mm") if name in bounds
     )

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from hvs_suite import files, registry, rollout
 from hvs_suite.errors import OptionError, PolicyError, ScenarioError
 from hvs_suite.eval import action_log, progress_file, provenance, result_file
-from hvs_suite.eval.trial import PlayTrial, Trial, tolerances
+from hvs_suite.eval.trial import PlayTrial, Trial
 from hvs_suite.policies.catalogue import policy_factory
 from hvs_suite.policies.context import Blindfolded
 from hvs_suite.policies.imported import ImportedFactory
@@ -223,7 +223,7 @@ def evaluate(
                 contender.name,
                 split,
                 rows,
-                tolerances=tolerances(variant),
+                tolerances=variant.tolerances,
                 time_limit_steps=variant.time_limit_steps,
             ),
             metadata=result_file.Metadata(
@@ -231,7 +231,7 @@ def evaluate(
                 suite_version=provenance.suite_version(),
                 task_version=variant.version,
                 task_digest=lock.digest(task),
-                tolerances=tolerances(variant),
+                tolerances=variant.tolerances,
                 time_limit_steps=variant.time_limit_steps,
                 options={},
                 policy_kind=contender.kind,

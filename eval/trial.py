@@ -197,12 +197,6 @@ def play_trial(
     return row, np.array(actions, np.float32).reshape(-1, *spec.shape), nearness
 
 
-def tolerances(variant: Any) -> dict[str, float]:
-    """Returns the bound of each error that a task bounds (mm, deg), by the error's name."""
-    bounds = {name: getattr(variant, name.replace("error", "tolerance")) for name in ERRORS}
-    return {name: float(bound) for name, bound in bounds.items() if bound is not None}
-
-
 def _play_policy(env: Stage, policy: Policy, scenario: int, limit_s: float) -> Trial:
     """A live policy's trial: times, checks and guards each of its decisions."""
     shape = env.action_spec().shape
@@ -343,7 +337,7 @@ def _near_bounds(variant: Any) -> list[tuple[str, float, float]]:
     """Name, bound and unit of nearness of each bounded error."""
     return [
         (name, bound, NEAR_DEG if name.endswith("deg") else NEAR_MM)
-        for name, bound in tolerances(variant).items()
+        for name, bound in variant.tolerances.items()
     ]
 
 

@@ -26,7 +26,6 @@ from hvs_suite.eval.trial import (
     EpisodeLostError,
     Stage,
     play_trial,
-    tolerances,
 )
 from hvs_suite.policies import builtin
 from hvs_suite.rollout import Action, Observation
@@ -168,7 +167,7 @@ def check_task(path: Path, result: Result) -> None:
     for name, said, known in (
         ("task_version", metadata.task_version, variant.version),
         ("task_digest", metadata.task_digest, lock.digest(ours)),
-        ("tolerances", metadata.tolerances, tolerances(variant)),
+        ("tolerances", metadata.tolerances, variant.tolerances),
         ("time_limit_steps", metadata.time_limit_steps, variant.time_limit_steps),
     ):
         if said != known:

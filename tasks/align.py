@@ -190,7 +190,6 @@ class Align(ServoTask):
 
     def finish_step(self, physics: mjcf.Physics, *, collided: bool, at_time_limit: bool) -> None:
         """Measure errors, count the hold, decide success, collision and truncation."""
-        self._steps += 1
         self._measure(physics)
         inside = self.is_inside and not collided
         self._n_inside = self._n_inside + 1 if inside else 0
@@ -256,11 +255,6 @@ class Align(ServoTask):
         if self._scenario is None:
             raise RuntimeError("reset the environment first")
         return self._scenario
-
-    @property
-    def steps(self) -> int:
-        """Control steps since the reset."""
-        return self._steps
 
     @property
     def is_inside(self) -> bool:
@@ -452,7 +446,6 @@ class Align(ServoTask):
         return bool(0.0 <= length < 1.0 - _RAY_SLACK_M / float(np.linalg.norm(ray)))
 
     def _clear_outcome(self) -> None:
-        self._steps = 0
         self._n_inside = 0
         self._n_clipped = 0
         self._inside_once = False

@@ -35,7 +35,8 @@ class Finetune:
         noise: Standard deviation of the exploration, as a share of the bound.
         actor_rate: Learning rate of what is added.
         penalty: Weight of the squared share of the bound that is used.
-        updates: Updates after every 40 environment steps.
+        updates: Updates after every 40 environment steps; four times as many while the critics
+            learn alone.
         eval_every: Environment steps between evaluations; one more comes at start and end.
         eval_episodes: Episodes an evaluation, on scenes of a split of their own.
     """

@@ -9,6 +9,7 @@ through the kinematics.
 import torch
 from torch import Tensor
 
+from hvs_suite.policies.finetune.stage import GOAL, JOINTS, NORMAL
 from hvs_suite.policies.hvs import geometry
 from hvs_suite.policies.hvs.network import CONTROL_PERIOD_S, N_JOINTS, HvsNetwork
 
@@ -26,10 +27,8 @@ class Outlook:
     """
 
     def __init__(self, network: HvsNetwork, bound: float) -> None:
-        self._scale = network.shape.error_scale
+        self._network = network
         self._bound = bound
-        self._joint_range = network.joint_range
-        self._longest_step = network.joint_speed * CONTROL_PERIOD_S
 
     def __call__(self, features: Tensor, privileged: Tensor, action: Tensor) -> Tensor:
         """Look ahead.
@@ -43,16 +42,14 @@ class Outlook:
             (B, 10), each as asinh(x / error scale): from flange to goal (3), the rotation vector
             from flange axis to inward normal (3), and the length of either, also on a finer scale.
         """
-        joints = privileged[:, :N_JOINTS] * self._joint_range
-        goal, normal = privileged[:, -6:-3], privileged[:, -3:]
-        out = features[:, -N_JOINTS:] + self._bound * action
-        longest = self._longest_step
-        # Nothing larger than the first bound is meant, and its sinh would overflow.
-        step = (self._scale * torch.sinh(out.clamp(-8.0, 8.0))).clamp(-longest, longest)
-        motion = geometry.flange_motion(joints + step)
-        way = goal - motion.position
-        turn = torch.linalg.cross(motion.rotation[:, :, 2], -normal, dim=1)
+        network = self._network
+        longest = network.joint_speed * CONTROL_PERIOD_S
+        step = network.to_step(features[:, -N_JOINTS:] + self._bound * action)
+        joints = privileged[:, JOINTS] * network.joint_range
+        motion = geometry.flange_motion(joints + step.clamp(-longest, longest))
+        way = privileged[:, GOAL] - motion.position
+        turn = torch.linalg.cross(motion.rotation[:, :, 2], -privileged[:, NORMAL], dim=1)
         # Where the length is 0 the norm has no slope.
         lengths = [(each.square().sum(dim=1, keepdim=True) + 1e-12).sqrt() for each in (way, turn)]
         errors = torch.cat([way, turn, *lengths, *(FINE * length for length in lengths)], dim=1)
-        return torch.asinh(errors / self._scale)
+        return torch.asinh(errors / network.shape.error_scale)

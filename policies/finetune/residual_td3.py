@@ -1,7 +1,8 @@
 """TD3 on a residual: Stable-Baselines3's, with critics that see more than the actor.
 
-What differs from its TD3: actor and critics read their own keys of the observation; the critics are
-an ensemble with layer norm of which two, drawn anew for each update, make the target (RLPD: Ball et
+What differs from its TD3: actor and critics read their own keys of the observation, and critics
+where an action leads in place of the action (docs/experiments/foresight.md); the critics are an
+ensemble with layer norm of which two, drawn anew for each update, make the target (RLPD: Ball et
 al., 2023, https://arxiv.org/abs/2302.02948); the actor stands still while they warm up; and it is
 held to the base by a penalty against the normalised value, as in TD3+BC (Fujimoto and Gu, 2021,
 https://arxiv.org/abs/2106.06860).
@@ -25,9 +26,8 @@ from hvs_suite.policies.hvs.network import make_residual, normed_layers
 
 N_TARGET_CRITICS = 2
 WARM_UP_UPDATES = 4
-"""While the critics learn alone, this many times as many updates. What a scene is worth in the end
-has to come all the way to its beginning before the actor can trust them; on values that still rise
-everywhere, it learned to dawdle."""
+"""While the critics learn alone, this many times as many updates: what a scene is worth in the end
+has to come all the way to its beginning before the actor can trust them."""
 
 
 class Keys(BaseFeaturesExtractor):

@@ -23,7 +23,7 @@ class Settings:
         replay_size: Transitions kept.
         warm_up_steps: Environment steps in which the critics learn alone.
         collect_steps: Environment steps an iteration.
-        updates: Updates after an iteration.
+        updates: Updates after an iteration; four times as many while the critics learn alone.
         noise: Standard deviation of the exploration, as a share of the bound.
         target_noise: Standard deviation of the noise on the target's actions, likewise.
         bound: The most that the residual adds to the head's output.

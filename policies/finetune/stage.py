@@ -27,6 +27,8 @@ FEATURES = "features"
 PRIVILEGED = "privileged"
 """Key of what only the critics read, see `privileged_state`."""
 PRIVILEGED_SIZE = 32
+JOINTS, GOAL, NORMAL = slice(0, N_JOINTS), slice(26, 29), slice(29, 32)
+"""Where true joint positions, the goal's place and its normal stand in it."""
 
 Observation = dict[str, npt.NDArray[np.float32]]
 
@@ -47,7 +49,7 @@ def privileged_state(environment: Any, error_scale: float) -> npt.NDArray[np.flo
     rotation, position = kinematics().flange_pose(truth["joint_positions"])
     way = truth["goal_position"] - position
     turn = np.cross(rotation[:, 2], -truth["goal_normal"])
-    left = 1.0 - environment.task.steps / variant.time_limit_steps
+    left = 1.0 - environment.control_steps / variant.time_limit_steps
     return np.concatenate(
         [
             truth["joint_positions"] / JOINT_RANGE_RAD,

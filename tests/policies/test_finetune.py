@@ -11,6 +11,7 @@ from rl_state import state_of
 from safetensors.torch import load_file
 
 import hvs_suite
+from hvs_suite.cli.finetune import Finetune
 from hvs_suite.cli.main import run
 from hvs_suite.datasets.expert import Expert
 from hvs_suite.errors import OptionError, PolicyError
@@ -334,6 +335,14 @@ def test_a_run_whose_success_falls_ends_and_keeps_what_it_had(base, tmp_path, mo
 def test_settings_that_make_no_sense_are_refused(setting):
     with pytest.raises(OptionError):
         Settings(**setting)
+
+
+def test_the_command_has_the_defaults_of_the_method():
+    command = {field.name: field.default for field in dataclasses.fields(Finetune)}
+    method = {field.name: field.default for field in dataclasses.fields(Settings)}
+    shared = command.keys() & method.keys()
+    assert "warm_up_steps" in shared
+    assert {name: command[name] for name in shared} == {name: method[name] for name in shared}
 
 
 def test_what_cannot_be_fine_tuned_is_refused(whole, base, tmp_path, capsys):
