@@ -175,6 +175,8 @@ def _sort(
                 believed = (decision.target - decision.motion.position)[0].double().numpy()
                 off_mm = 1e3 * float(np.linalg.norm((believed - (target - flange))[:2]))
         executed = np.clip(action, spec.minimum, spec.maximum).astype(np.float32)
+        if network is not None and memory is not None:
+            memory = network.commanded(memory, torch.from_numpy(executed)[None])
         time_step = env.step(executed)
         errors_mm.append(float(env.info["position_error_mm"]))
     return Failure(

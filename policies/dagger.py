@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.datasets.demonstration import MakeEnvironment
-from hvs_suite.datasets.features import ACTION, Frame, observed_part
+from hvs_suite.datasets.features import ACTION, ACTION_EXECUTED, Frame, observed_part
 from hvs_suite.datasets.looking import Demonstrator
 from hvs_suite.datasets.recorder import in_order
 from hvs_suite.errors import OutputError
@@ -104,9 +104,10 @@ def _played(
     frames: list[Frame] = []
     while not time_step.last():
         frame = observed_part(env.variant, time_step.observation, env)
-        frames.append(frame | label())
-        action = np.clip(policy.select_action(time_step.observation), -1.0, 1.0)
-        time_step = env.step(action.astype(np.float32))
+        labelled = frame | label()
+        action = np.clip(policy.select_action(time_step.observation), -1.0, 1.0).astype(np.float32)
+        frames.append(labelled | {ACTION_EXECUTED: action})
+        time_step = env.step(action)
     info = env.info
     return PlayedEpisode(scenario, frames, info["is_success"], info["collision"])
 

@@ -6,7 +6,7 @@ package, which takes longer than opening a small dataset.
 
 import dataclasses
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
+from hvs_suite.datasets.features import ACTION, ACTION_EXECUTED
 from hvs_suite.datasets.metadata import read_metadata
 from hvs_suite.errors import DatasetError, OptionError
 from hvs_suite.policies.frame_cache import (
@@ -25,16 +26,10 @@ from hvs_suite.policies.frame_cache import (
     data_files,
     read_rows,
 )
-from hvs_suite.policies.hvs.geometry import (
-    Calibration,
-    calibrate,
-    flange_motion,
-    seen_from_afar,
-    seen_from_hand,
-)
-from hvs_suite.policies.hvs.network import IMAGE_PREFIX, MEMORY, MEMORY_SIZE, N_JOINTS, STATE
+from hvs_suite.policies.hvs.geometry import Calibration, calibrate
+from hvs_suite.policies.hvs.network import IMAGE_PREFIX, MEMORY, N_JOINTS, STATE
+from hvs_suite.policies.remembered import remembered
 
-ACTION = "action"
 EPISODE = "episode_index"
 GOAL_POSITION = "privileged.goal_position"
 GOAL_NORMAL = "privileged.goal_normal"
@@ -45,8 +40,6 @@ HELD_OUT_SHARE = 0.05
 # Philox words that keep this stream apart from the training order.
 HELD_OUT_STREAM = 1
 MEMORY_STREAM = 3
-UV_SIGMA = {"eih": 0.006, "eth": 0.003}
-"""How well a trained eye finds the target in its image of [-1, 1], one sigma."""
 
 Column = npt.NDArray[Any]
 
@@ -98,8 +91,8 @@ class Manifest:
 
     @property
     def trained_keys(self) -> list[str]:
-        """The features that training reads: images, state, action, targets, goal."""
-        wanted = {STATE, ACTION, GOAL_POSITION, GOAL_NORMAL}
+        """The features that training reads: images, state, actions, targets, goal."""
+        wanted = {STATE, ACTION, ACTION_EXECUTED, GOAL_POSITION, GOAL_NORMAL}
         wanted |= {TARGET_PREFIX + name for name in self.cameras}
         wanted |= {IMAGE_PREFIX + name for name in self.cameras}
         return [key for key in self.features if key in wanted]
@@ -209,7 +202,7 @@ class FramePool:
         if self._calibration is None:
             return recording
         key = np.random.Philox(key=[self._seed, MEMORY_STREAM], counter=number)
-        memory = remembered_targets(
+        memory = remembered(
             recording.columns,
             list(self.manifest.cameras),
             self._calibration,
@@ -313,61 +306,6 @@ class Demonstrations(FramePool):
         self.training = np.concatenate([self.training, np.arange(start, len(self))])
 
 
-def remembered_targets(
-    columns: Mapping[str, Column],
-    cameras: Sequence[str],
-    calibration: Calibration,
-    random: np.random.Generator,
-) -> npt.NDArray[np.float32]:
-    """What a policy remembers at each frame: the target where each camera last saw it.
-
-    It is off by what the eye errs in the image, and by what calibration and joints err in space.
-
-    Args:
-        columns: State, targets in the images and ``episode_index``, (n, k) each.
-        cameras: Their names, in the order of the network's eyes.
-        calibration: Of the network.
-        random: Draws how far off in the image.
-
-    Returns:
-        For each camera the place (m, base frame), and 1 if it saw the target earlier in the
-        episode, else 0 and the place 0, (n, 4 per camera).
-    """
-    n = len(columns[EPISODE])
-    motion = flange_motion(torch.from_numpy(columns[STATE][:, :N_JOINTS]))
-    height = torch.tensor(calibration.plane_height_m, dtype=torch.float32)
-    episodes, frames = columns[EPISODE], np.arange(n)
-    first = np.maximum.accumulate(np.where(np.diff(episodes, prepend=-1) != 0, frames, 0))
-    memory = np.zeros((n, MEMORY_SIZE * len(cameras)), np.float32)
-    for i, camera in enumerate(cameras):
-        target = columns.get(TARGET_PREFIX + camera)
-        if target is None:
-            continue
-        off = UV_SIGMA[camera] * random.normal(size=(n, 2))
-        uv = torch.from_numpy((target[:, :2] + off).astype(np.float32))
-        if camera == "eih":
-            rays = torch.from_numpy(calibration.rays.astype(np.float32))
-            place = seen_from_hand(motion, uv, rays, height).numpy()
-        else:
-            homography = torch.from_numpy(calibration.homography.astype(np.float32))
-            place = seen_from_afar(uv, homography, height).numpy()
-        seen = _in_view(target)
-        if camera == "eih":
-            seen &= place[:, 3] > 0
-        last_seen = np.maximum.accumulate(np.where(seen, frames, -1))
-        before = np.concatenate([[-1], last_seen[:-1]])
-        known = before >= first
-        slot = memory[:, MEMORY_SIZE * i : MEMORY_SIZE * (i + 1)]
-        slot[known, :3] = place[before[known], :3]
-        slot[known, 3] = 1.0
-    return memory
-
-
-def _in_view(target: Column) -> npt.NDArray[np.bool_]:
-    """Which frames show the target, (n,)."""
-    return np.asarray((target[:, 3] > 0.5) & (np.abs(target[:, :2]).max(axis=1) <= 1.0))
-
-
 def calibration_of(root: Path) -> Calibration:
     """Fit the camera maps of the `hvs` network to a dataset's privileged columns.
 
@@ -409,7 +347,7 @@ def _standoff(manifest: Manifest) -> float:
 
 
 def _read_columns(manifest: Manifest) -> dict[str, Column]:
-    """Read the columns that training uses: state, action, targets, goal, episode.
+    """Read the columns that training uses: state, actions, targets, goal, episode.
 
     Returns:
         Key to (n_frames, k) float32; ``episode_index`` to (n_frames,) int64.

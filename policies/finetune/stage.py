@@ -127,6 +127,8 @@ class ResidualStage(gymnasium.Wrapper[Any, Any, Any, Any]):
         added = self._bound * torch.from_numpy(np.clip(action, -1.0, 1.0).astype(np.float32))
         with torch.inference_mode():
             command = self._network.to_action(self._decision.out + added, self._state)
+            assert self._decision.memory is not None
+            self._memory = self._network.commanded(self._decision.memory, command)
         observation, reward, terminated, truncated, info = self.env.step(command[0].numpy())
         before, self._potential = self._potential, self._phi(info)
         after = 0.0 if terminated or truncated else self._potential
@@ -141,7 +143,6 @@ class ResidualStage(gymnasium.Wrapper[Any, Any, Any, Any]):
         with one_torch_thread(), torch.inference_mode():
             images, self._state = network_inputs(self._network, observation)
             self._decision = self._network(images, self._state, self._memory)
-        self._memory = self._decision.memory
         return {
             FEATURES: self._decision.features[0].numpy().copy(),
             PRIVILEGED: privileged_state(self._environment, self._network.shape.error_scale),

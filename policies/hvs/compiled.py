@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from hvs_suite.policies.hvs import geometry
-from hvs_suite.policies.hvs.network import MEMORY_SIZE, HvsNetwork
+from hvs_suite.policies.hvs.network import HvsNetwork, memory_size
 
 # TorchScript looks at what it runs before it settles how.
 _WARM_UP_CALLS = 3
@@ -30,7 +30,7 @@ class CompiledNetwork:
         shape = network.shape
         images = tuple(torch.zeros(1, *(c, side, side)) for c, side in shape.cameras.values())
         state = torch.zeros(1, shape.state_dim)
-        self._nothing = torch.zeros(1, MEMORY_SIZE * len(images))
+        self._nothing = torch.zeros(1, memory_size(len(images)))
         with torch.no_grad(), warnings.catch_warnings():
             # Tracing holds for batches of one alone, which is all it is made for; and newer Python
             # will want another compiler, which needs a C++ one installed.
@@ -55,13 +55,14 @@ class CompiledNetwork:
 
         Returns:
             Joint position targets in units of the joint range, (1, 7) in [-1, 1], and the memory
-            (1, 4 n) for the next call.
+            (1, 4 n + 10) for the next call.
         """
         seen = tuple(images[name] for name in self._network.shape.cameras)
         target, height, memory = self._commands(
             seen, state, self._nothing if memory is None else memory
         )
-        return self._network.within_bounds(target, height), memory
+        action = self._network.within_bounds(target, height)
+        return action, self._network.commanded(memory, action)
 
 
 class _Commands(nn.Module):

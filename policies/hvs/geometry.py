@@ -40,6 +40,10 @@ LEAST_HEIGHT_MARGIN_M = 0.01
 # Rounds of Gauss-Newton that lift the flange, and their damping.
 LIFTS = 4
 LIFT_DAMPING_M = 0.05
+# The most that a target may lie above or below the surface as the joints have it (m).
+HEIGHT_BOUND_M = 0.01
+# What is seen from closer than the distance at the goal over this counts no more than that.
+NEAREST_LOOK = 1.5
 # Least number of frames that show the target before a camera is calibrated from data.
 MIN_CALIBRATION_FRAMES = 60
 
@@ -242,6 +246,43 @@ def seen_from_hand(
     )
     point = motion.position + reach.clamp(0.0, 1.5)[:, None] * direction
     return torch.cat([torch.where(valid > 0, point, below), valid], dim=1)
+
+
+def look_height(
+    motion: FlangeMotion,
+    uv: Tensor,
+    diameter: Tensor,
+    rays: Tensor,
+    size_at_1m: Tensor,
+    plane_height_m: Tensor,
+    standoff_m: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """How high a disc lies, by how large it appears to the eye in the hand.
+
+    An error of some share of a pixel is an error of the distance that grows with its square; so a
+    look weighs as the fourth power of how close it is, one from the goal 1.
+
+    Args:
+        motion: Pose of the flange, where the camera sits.
+        uv: Image coordinates of the centre, (B, 2).
+        diameter: Apparent diameter (image widths), (B, 1).
+        rays: See `seen_from_hand`.
+        size_at_1m: See `Calibration`, scalar.
+        plane_height_m: Height of the surface, scalar (m).
+        standoff_m: Distance between flange and target at the goal, scalar (m).
+
+    Returns:
+        (B, 1) each: distance along the optical axis, at most 2 m; height over the surface, within
+        10 mm; and weight, 0 where the size means nothing.
+    """
+    depth = (size_at_1m / diameter).clamp(max=2.0)
+    direction = _homogeneous(uv) @ rays.T
+    direction = direction / direction[:, 2:].clamp(min=0.1)
+    along = (motion.rotation @ direction[:, :, None])[:, 2]
+    height = motion.position[:, 2:] + depth * along - plane_height_m
+    closeness = (standoff_m / depth.clamp(min=1e-6)).clamp(max=NEAREST_LOOK)
+    weight = torch.where(size_at_1m > 0, closeness**4, torch.zeros_like(closeness))
+    return depth, height.clamp(-HEIGHT_BOUND_M, HEIGHT_BOUND_M), weight
 
 
 def seen_from_afar(uv: Tensor, homography: Tensor, plane_height_m: Tensor) -> Tensor:

@@ -109,8 +109,7 @@ class HvsPolicy(PreTrainedPolicy):
             batch: The inputs (images uint8, or float in [0, 1]), ``action`` (B, 7), and where the
                 dataset has them ``privileged.target_<camera>`` (B, 4),
                 ``privileged.goal_position`` and ``privileged.goal_normal`` (B, 3); ``memory``
-                (B, 4 n) where each of n cameras saw the target earlier in the episode, empty if it
-                is missing.
+                (B, 4 n + 10) what a policy with n cameras remembers, nothing if it is missing.
 
         Returns:
             The loss, and what else can be learned from it.
@@ -197,8 +196,10 @@ class HvsPolicy(PreTrainedPolicy):
         if self._memory is not None and len(self._memory) != len(next(iter(images.values()))):
             self._memory = None  # Other environments than before.
         decision = self.network(images, state, self._memory)
-        self._memory = decision.memory
-        return self.network.to_action(decision.out, state)[:, None]
+        action = self.network.to_action(decision.out, state)
+        if decision.memory is not None:
+            self._memory = self.network.commanded(decision.memory, action)
+        return action[:, None]
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:

@@ -4,8 +4,9 @@ Each camera has its own small convolutional encoder that ends in one *keypoint*:
 channel is a distribution over the image, its mean the target's centre. The keypoints are placed in
 space by fixed geometry, and a small perceptron turns joints and target into a joint step on a
 logarithmic scale, so that errors of a micrometre and of a metre both teach it something. Where a
-camera does not see the target, the place where it last saw it stands in: a memory of three numbers
-for each camera, which the caller keeps.
+camera does not see the target, the place where it last saw it stands in; how high the target lies
+is the mean of what its size has said so far; and where the arm has been sent already, it need not
+be sent again: a memory of a few numbers, which the caller keeps.
 
 No LeRobot in here: a rollout worker starts in the time torch takes to import.
 """
@@ -28,10 +29,13 @@ from hvs_suite.policies.hvs.geometry import Calibration
 IMAGE_PREFIX = "observation.images."
 STATE = "observation.state"
 MEMORY = "memory"
-"""Key of a batch: where the target was last seen before, see `HvsNetwork.forward`."""
-MEMORY_SIZE = 4
-"""Numbers that are remembered of each camera."""
+"""Key of a batch: what the policy remembers, see `HvsNetwork.forward`."""
 N_JOINTS = 7
+SLOT_SIZE = 4
+"""Numbers that are remembered of each camera."""
+HEIGHT_SUMS = slice(-N_JOINTS - 3, -N_JOINTS - 1)
+SET_POINT = slice(-N_JOINTS - 1, -1)
+"""Where these stand in the memory, behind the cameras' slots; last comes 1 once there is any."""
 FEATURE_SIZE = 28
 """Cells along the side of a feature map, about."""
 OUTLINE_SIZE = 7
@@ -54,6 +58,15 @@ WAY_FEATURES = 2 * (N_JOINTS - 1) + 2
 """Of `HvsNetwork._way`."""
 CONTROL_PERIOD_S = 0.1
 """Of all named tasks."""
+
+
+def memory_size(n_cameras: int) -> int:
+    """Numbers that a policy remembers.
+
+    Args:
+        n_cameras: How many cameras it has.
+    """
+    return SLOT_SIZE * n_cameras + 2 + N_JOINTS + 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,8 +154,8 @@ class Decision:
         features: What a residual reads, (B, n): the head's inputs, and what the head alone says.
         sightings: Camera name to what it saw.
         target: Where the target is taken to be, (B, 3) m in the base frame; None without joints.
-        memory: What to remember for the next observation, (B, 4 n) for n cameras; None without
-            joints.
+        memory: What to remember for the next observation, (B, 4 n + 10) for n cameras, before
+            the action is known, see `HvsNetwork.commanded`; None without joints.
         motion: Where the flange is, by the measured joints; None without them.
     """
 
@@ -313,9 +326,9 @@ class HvsNetwork(nn.Module):
             # What each camera sees, what it saw, and what is made of all that.
             n_estimates = 2 * n_cameras + 1
             width += 3 * N_JOINTS + 12 + ESTIMATE_FEATURES * n_estimates + N_JOINTS
-            width += WAY_FEATURES
+            width += WAY_FEATURES + 3 * N_JOINTS
             if "eih" in shape.cameras:
-                width += 1 + WAY_FEATURES + 1
+                width += 1 + WAY_FEATURES + 1 + N_JOINTS + 1
             if shape.state_dim == POSITIONS_AND_VELOCITIES:
                 width += N_JOINTS
         hidden = shape.hidden
@@ -337,8 +350,12 @@ class HvsNetwork(nn.Module):
         self.memory_trust = nn.Parameter(torch.zeros(n_cameras))
         self.step_gain = nn.Parameter(torch.full((N_JOINTS,), 0.5))
         self.stride_gain = nn.Parameter(torch.full((N_JOINTS,), 0.5))
+        self.onward_step_gain = nn.Parameter(torch.zeros(N_JOINTS))
+        self.onward_stride_gain = nn.Parameter(torch.zeros(N_JOINTS))
         # How much higher to aim until the eye in the hand has seen the target.
         self.above_gain = nn.Parameter(torch.zeros(1))
+        # How many looks from the goal it takes to believe half of the height that they show.
+        self.log_height_doubt = nn.Parameter(torch.zeros(()))
         self.n_features = width + N_JOINTS
         self.residual = (
             make_residual(self.n_features, shape.residual_hidden) if shape.residual_hidden else None
@@ -389,8 +406,11 @@ class HvsNetwork(nn.Module):
             images: Camera name to (B, C, H, W), uint8, or float in [0, 1].
             state: Measured joint positions (rad), then velocities (rad/s), (B, 14) or (B, 7);
                 None if the policy has no joint inputs.
-            memory: For each camera, in the order of the eyes, where it last saw the target (m, base
-                frame), and 1 if it ever did in this episode, else 0, (B, 4 n); None for never.
+            memory: (B, 4 n + 10): for each camera, in the order of the eyes, where it last saw the
+                target (m, base frame), and 1 if it ever did in this episode, else 0; the weighted
+                sum of the heights (m) that its size showed, and the sum of the weights; the set
+                point that all actions so far lead to (rad), and 1 if there is one. None at the
+                beginning of an episode.
 
         Returns:
             The decision.
@@ -419,45 +439,59 @@ class HvsNetwork(nn.Module):
             return Decision(out, known, sightings, None, None, None)
         q = state[:, :N_JOINTS]
         if memory is None:
-            memory = state.new_zeros(len(state), MEMORY_SIZE * len(sightings))
+            memory = state.new_zeros(len(state), memory_size(len(sightings)))
         motion = geometry.flange_motion(q)
-        target, estimates, remembered = self._place(motion, sightings, memory)
+        target, estimates, slots = self._place(motion, sightings, memory)
         scale = self.shape.error_scale
         lift = torch.zeros_like(target)
         lift[:, 2] = self.standoff
-        step = torch.asinh(geometry.joint_step(motion, target + lift - motion.position) / scale)
-        features += [torch.sin(q), torch.cos(q), q / self.joint_range]
-        features += [motion.position, motion.rotation.flatten(1), step]
+        sums = memory[:, HEIGHT_SUMS]
+        if "eih" in sightings:
+            # Where the joints lie about the height, the disc's size tells the truth.
+            depth, height, sums = self._height(motion, sightings["eih"], sums)
+            lift = lift + F.pad(height, (2, 0))
         goals = [target + lift]
         if "eih" in sightings:
             # Where a demonstrator heads for until the eye in the hand has seen the target.
             goals.append(goals[0] + lift.new_tensor([0.0, 0.0, LOOK_DOWN_M]))
+        set_point = torch.where(memory[:, -1:] > 0, memory[:, SET_POINT], q)
+        remembered = torch.cat([slots, sums, set_point, torch.ones_like(q[:, :1])], dim=1)
+        step = torch.asinh(geometry.joint_step(motion, goals[0] - motion.position) / scale)
+        features += [torch.sin(q), torch.cos(q), q / self.joint_range]
+        features += [motion.position, motion.rotation.flatten(1), step]
         ways, strides = self._ways(q, goals)
         features += ways
-        stride = strides[0]
+        strides = [torch.asinh(each / scale) for each in strides]
+        # From where the arm is sent: it trails its set point, and may not even have begun to move.
+        pending = set_point - q
+        sent = geometry.flange_motion(set_point)
+        onward_step = pending + geometry.joint_step(sent, goals[0] - sent.position)
+        onward_step = torch.asinh(onward_step / scale)
+        onward = [torch.asinh((pending + each) / scale) for each in self._ways(set_point, goals)[1]]
+        later = [torch.asinh(pending / scale), onward_step, *onward]
+        stride, onward_stride = strides[0], onward[0]
         if "eih" in sightings:
-            unseen = 1.0 - remembered[:, MEMORY_SIZE - 1 : MEMORY_SIZE]
+            unseen = 1.0 - remembered[:, SLOT_SIZE - 1 : SLOT_SIZE]
             features.append(unseen)
             stride = stride + self.above_gain * unseen * (strides[1] - stride)
-        if "eih" in sightings:
-            # Where the joints lie about the height, the disc's size tells the truth.
-            diameter = torch.exp(sightings["eih"].log_diameter.clamp(-5.0, 2.0))
-            depth = (self.size_at_1m / diameter).clamp(max=2.0)
+            onward_stride = onward_stride + self.above_gain * unseen * (onward[1] - onward_stride)
             features.append(torch.asinh((depth - self.standoff) / scale))
+            later.append(torch.asinh(height / scale))
         if self.shape.state_dim == POSITIONS_AND_VELOCITIES:
             features.append(state[:, N_JOINTS:] / self.joint_speed)
         offsets = estimates[:, :, :3] + (lift - motion.position)[:, None]
         in_flange = torch.asinh(offsets @ motion.rotation / scale)
         features.append(torch.cat([offsets, in_flange, estimates[:, :, 3:]], dim=2).flatten(1))
-        inputs = torch.cat(features, dim=1)
+        inputs = torch.cat([*features, *later], dim=1)
         out = self.head(inputs) + self.step_gain * step + self.stride_gain * stride
+        out = out + self.onward_step_gain * onward_step + self.onward_stride_gain * onward_stride
         if not self.training:
             # As long as all cameras are sure that the target is hidden, and none has seen it, the
             # head can know no way there. What it learns in training must not wait for eyes.
-            has_seen = remembered[:, MEMORY_SIZE - 1 :: MEMORY_SIZE].amax(dim=1) > 0
+            has_seen = slots[:, SLOT_SIZE - 1 :: SLOT_SIZE].amax(dim=1) > 0
             for sighting in sightings.values():
                 has_seen = has_seen | (sighting.visible_logit[:, 0] > -SEEN_LOGIT)
-            out = torch.where(has_seen[:, None], out, self._look_out(q))
+            out = torch.where(has_seen[:, None], out, self._look_out(q, set_point))
         out, known = self._with_residual(inputs, out)
         return Decision(out, known, sightings, target, remembered, motion)
 
@@ -470,30 +504,62 @@ class HvsNetwork(nn.Module):
 
         Returns:
             For each goal, (B, 14): what is left of the turns of A1 to A6, its time (s), 1 if the
-            posture lies within the joint ranges, else 0, and the joint step that goes there; and
-            for each that step alone, (B, 7), A7 at rest. Turns and steps are on the logarithmic
-            scale.
+            posture lies within the joint ranges, else 0, and the joint step that goes there, turns
+            and step on the logarithmic scale; and for each that step alone, (B, 7) rad, A7 at rest.
         """
         n = len(goals)
         turns, time_s, within = geometry.way_to_posture(q.repeat(n, 1), torch.cat(goals))
         step = turns * (CONTROL_PERIOD_S / time_s.clamp(min=CONTROL_PERIOD_S))
-        turns, step = (torch.asinh(each / self.shape.error_scale) for each in (turns, step))
-        ways = torch.cat([turns, time_s, within, step], dim=1)
+        scale = self.shape.error_scale
+        ways = torch.cat(
+            [torch.asinh(turns / scale), time_s, within, torch.asinh(step / scale)], dim=1
+        )
         return list(ways.chunk(n)), list(F.pad(step, (0, 1)).chunk(n))
 
-    def _look_out(self, q: Tensor) -> Tensor:
+    def _look_out(self, q: Tensor, set_point: Tensor) -> Tensor:
         """The step to where a demonstrator looks for the target, each joint as fast as it can.
 
         Args:
             q: Measured joint positions, (B, 7) rad.
+            set_point: Where the arm has been sent, (B, 7) rad.
 
         Returns:
             As the head says it, (B, 7).
         """
         bound = (CONTROL_PERIOD_S + LEAD_S) * self.joint_speed
-        turns = torch.as_tensor(LOOK_OUT_RAD).to(q) - q
+        turns = torch.as_tensor(LOOK_OUT_RAD).to(q) - set_point
         turns[:, -1] = 0.0
-        return torch.asinh(turns.clamp(-bound, bound) / self.shape.error_scale)
+        step = set_point + turns.clamp(-bound, bound) - q
+        return torch.asinh(step / self.shape.error_scale)
+
+    def _height(
+        self, motion: geometry.FlangeMotion, sighting: Sighting, sums: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """How high the target lies, by its size in the eye in the hand; see `geometry.look_height`.
+
+        Args:
+            motion: Of the flange, by the measured joints.
+            sighting: Of the eye in the hand.
+            sums: Of what earlier looks showed, (B, 2).
+
+        Returns:
+            Distance along the optical axis (m), height over the surface (m), (B, 1) each, and the
+            sums with this look, (B, 2).
+        """
+        diameter = torch.exp(sighting.log_diameter.clamp(-5.0, 2.0))
+        depth, height, weight = geometry.look_height(
+            motion,
+            sighting.uv,
+            diameter,
+            self.rays,
+            self.size_at_1m,
+            self.plane_height,
+            self.standoff,
+        )
+        weight = weight * (sighting.visible_logit > SEEN_LOGIT)
+        sums = sums + torch.cat([weight * height, weight], dim=1)
+        believed = sums[:, :1] / (sums[:, 1:] + torch.exp(self.log_height_doubt))
+        return depth, believed, sums.detach()
 
     def _with_residual(self, inputs: Tensor, out: Tensor) -> tuple[Tensor, Tensor]:
         """The output with what fine-tuning adds to it, and the features that this reads."""
@@ -513,7 +579,8 @@ class HvsNetwork(nn.Module):
 
         Returns:
             The best estimate (B, 3) m; every estimate with its weight, (B, 2 n + 1, 4), what n
-            cameras see, what they remember, and the best; and the next memory (B, 4 n).
+            cameras see, what they remember, and the best; and the slots of the next memory
+            (B, 4 n).
         """
         places, logits, slots, hidden, held = [], [], [], [], []
         never = motion.position.new_full((len(motion.position), 1), NEVER_LOGIT)
@@ -524,7 +591,7 @@ class HvsNetwork(nn.Module):
                 visible = torch.where(point[:, 3:] > 0, visible, never)
             else:
                 point = geometry.seen_from_afar(sighting.uv, self.homography, self.plane_height)
-            slot = memory[:, MEMORY_SIZE * i : MEMORY_SIZE * (i + 1)]
+            slot = memory[:, SLOT_SIZE * i : SLOT_SIZE * (i + 1)]
             places.append(point[:, :3])
             slots.append(slot)
             logits.append(sighting.trust_logit + F.logsigmoid(visible))
@@ -558,6 +625,24 @@ class HvsNetwork(nn.Module):
             return out.clamp(-1.0, 1.0)
         target = self.to_target(out, state)
         return self.within_bounds(target, geometry.flange_motion(target).position[:, 2:])
+
+    def commanded(self, memory: Tensor, action: Tensor) -> Tensor:
+        """Remember an action too.
+
+        Args:
+            memory: As a `Decision` has it, (B, 4 n + 10).
+            action: What is done about it, (B, 7) in [-1, 1].
+
+        Returns:
+            What to remember for the next observation: the set point moved towards the action, as
+            fast as the joints may.
+        """
+        set_point = memory[:, SET_POINT]
+        longest = self.joint_speed * CONTROL_PERIOD_S
+        way = action * self.joint_range - set_point
+        memory = memory.clone()
+        memory[:, SET_POINT] = set_point + way.clamp(-longest, longest)
+        return memory
 
     def to_target(self, out: Tensor, state: Tensor) -> Tensor:
         """Joint angles that the head's output stands for, (B, 7) rad, bounds not looked at.
