@@ -38,7 +38,7 @@ def draw_run(out: Path) -> Path:
         OutputError: It cannot be written.
     """
     from matplotlib.figure import Figure
-    from matplotlib.ticker import LogFormatter
+    from matplotlib.ticker import LogLocator
 
     curves = read_curves(out / "training" / "tensorboard")
     rounds = _rounds(out / "training" / "dagger")
@@ -51,7 +51,8 @@ def draw_run(out: Path) -> Path:
     for axes in (whole, parts):
         axes.set(xlabel="optimiser step", yscale="log")
         axes.yaxis.set_major_formatter("{x:g}")
-        axes.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.5)))
+        axes.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
+        axes.yaxis.set_minor_formatter("{x:g}")
         axes.grid(alpha=0.3)
         if axes.lines:
             # Below the curves, which leave no corner free.

@@ -8,6 +8,7 @@ held to the base by a penalty against the normalised value, as in TD3+BC (Fujimo
 https://arxiv.org/abs/2106.06860).
 """
 
+from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -64,9 +65,22 @@ class ForesightedCritic(ContinuousCritic):
 
     def forward(self, obs: Any, actions: Tensor) -> tuple[Tensor, ...]:
         """Values of all critics, (B, 1) each; SB3's interface."""
+        return self.values(obs, actions, range(len(self.q_networks)))
+
+    def values(self, obs: Any, actions: Tensor, chosen: Iterable[int]) -> tuple[Tensor, ...]:
+        """Values of some of the critics.
+
+        Args:
+            obs: Vectors by name, (B, n).
+            actions: Shares of the bound, (B, 7).
+            chosen: Which critics.
+
+        Returns:
+            (B, 1) each.
+        """
         ahead = self.outlook(obs[FEATURES], obs[PRIVILEGED], actions)
         inputs = torch.cat([obs[FEATURES], obs[PRIVILEGED], ahead], dim=1)
-        return tuple(network(inputs) for network in self.q_networks)
+        return tuple(self.q_networks[index](inputs) for index in chosen)
 
 
 class ResidualPolicy(MultiInputPolicy):
@@ -133,6 +147,7 @@ class ResidualTD3(TD3):
         for group in self.actor.optimizer.param_groups:
             group["lr"] = self.actor_rate
         assert self.replay_buffer is not None
+        assert isinstance(self.critic_target, ForesightedCritic)
         frees_actor = self.num_timesteps >= self.warm_up_steps
         critic_losses, actor_losses, sizes, values = [], [], [], []
         for _ in range(gradient_steps if frees_actor else WARM_UP_UPDATES * gradient_steps):
@@ -142,9 +157,9 @@ class ResidualTD3(TD3):
                 noise = torch.randn_like(data.actions) * self.target_policy_noise
                 noise = noise.clamp(-self.target_noise_clip, self.target_noise_clip)
                 after = (self.actor_target(data.next_observations) + noise).clamp(-1.0, 1.0)
-                ensemble = torch.cat(self.critic_target(data.next_observations, after), dim=1)
-                chosen = torch.randperm(ensemble.shape[1])[:N_TARGET_CRITICS]
-                worth = ensemble[:, chosen].amin(dim=1, keepdim=True)
+                chosen = torch.randperm(len(self.critic_target.q_networks))[:N_TARGET_CRITICS]
+                judges = self.critic_target.values(data.next_observations, after, chosen.tolist())
+                worth = torch.cat(judges, dim=1).amin(dim=1, keepdim=True)
                 target = data.rewards + (1.0 - data.dones) * self.gamma * worth
             estimates = torch.cat(self.critic(data.observations, data.actions), dim=1)
             loss = F.mse_loss(estimates, target.expand_as(estimates)) * estimates.shape[1]
