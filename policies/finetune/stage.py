@@ -19,7 +19,8 @@ from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
 from hvs_suite.policies.checkpoint import network_inputs
 from hvs_suite.policies.finetune.folding import load_base
-from hvs_suite.policies.hvs.network import N_JOINTS, Decision
+from hvs_suite.policies.hvs.compiled import CompiledFeatures
+from hvs_suite.policies.hvs.network import N_JOINTS
 from hvs_suite.rollout import one_torch_thread
 
 FEATURES = "features"
@@ -95,13 +96,14 @@ class ResidualStage(gymnasium.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         with one_torch_thread():
             self._network = load_base(checkpoint)
+            self._features = CompiledFeatures(self._network)
         self._bound = bound
         self._shaping = shaping
         self._gamma = gamma
         self._environment: Any = env.unwrapped.environment  # type: ignore[attr-defined]
         self._tolerances = self._environment.variant.tolerances
         self._memory: torch.Tensor | None = None
-        self._decision: Decision | None = None
+        self._out: torch.Tensor | None = None
         self._state: torch.Tensor | None = None
         self._potential = 0.0
         sizes = {FEATURES: self._network.n_features, PRIVILEGED: PRIVILEGED_SIZE}
@@ -123,12 +125,12 @@ class ResidualStage(gymnasium.Wrapper[Any, Any, Any, Any]):
         self, action: npt.NDArray[np.float32]
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Play one control step with the base's action and what is added to it."""
-        assert self._decision is not None
+        assert self._out is not None
+        assert self._memory is not None
         added = self._bound * torch.from_numpy(np.clip(action, -1.0, 1.0).astype(np.float32))
         with torch.inference_mode():
-            command = self._network.to_action(self._decision.out + added, self._state)
-            assert self._decision.memory is not None
-            self._memory = self._network.commanded(self._decision.memory, command)
+            command = self._network.to_action(self._out + added, self._state)
+            self._memory = self._network.commanded(self._memory, command)
         observation, reward, terminated, truncated, info = self.env.step(command[0].numpy())
         before, self._potential = self._potential, self._phi(info)
         after = 0.0 if terminated or truncated else self._potential
@@ -142,8 +144,9 @@ class ResidualStage(gymnasium.Wrapper[Any, Any, Any, Any]):
     def _look(self, observation: Mapping[str, npt.NDArray[Any]]) -> Observation:
         with one_torch_thread(), torch.inference_mode():
             images, self._state = network_inputs(self._network, observation)
-            self._decision = self._network(images, self._state, self._memory)
+            assert self._state is not None
+            self._out, features, self._memory = self._features(images, self._state, self._memory)
         return {
-            FEATURES: self._decision.features[0].numpy().copy(),
+            FEATURES: features[0].numpy().copy(),
             PRIVILEGED: privileged_state(self._environment, self._network.shape.error_scale),
         }

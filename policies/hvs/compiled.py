@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from hvs_suite.policies.hvs import geometry
-from hvs_suite.policies.hvs.network import HvsNetwork, memory_size
+from hvs_suite.policies.hvs.network import Decision, HvsNetwork, memory_size
 
 # TorchScript looks at what it runs before it settles how.
 _WARM_UP_CALLS = 3
@@ -27,21 +27,7 @@ class CompiledNetwork:
 
     def __init__(self, network: HvsNetwork) -> None:
         self._network = network
-        shape = network.shape
-        images = tuple(torch.zeros(1, *(c, side, side)) for c, side in shape.cameras.values())
-        state = torch.zeros(1, shape.state_dim)
-        self._nothing = torch.zeros(1, memory_size(len(images)))
-        with torch.no_grad(), warnings.catch_warnings():
-            # Tracing holds for batches of one alone, which is all it is made for; and newer Python
-            # will want another compiler, which needs a C++ one installed.
-            warnings.simplefilter("ignore")
-            traced = torch.jit.trace(  # type: ignore[no-untyped-call]
-                _Commands(network).eval(), (images, state, self._nothing), check_trace=False
-            )
-            # Not optimize_for_inference: its convolutions take twice as long on larger images.
-            self._commands = torch.jit.freeze(traced)
-            for _ in range(_WARM_UP_CALLS):
-                self._commands(images, state, self._nothing)
+        self._commands = _Compiled(_Commands(network), network)
 
     def __call__(
         self, images: Mapping[str, Tensor], state: Tensor, memory: Tensor | None
@@ -57,12 +43,66 @@ class CompiledNetwork:
             Joint position targets in units of the joint range, (1, 7) in [-1, 1], and the memory
             (1, 4 n + 10) for the next call.
         """
-        seen = tuple(images[name] for name in self._network.shape.cameras)
-        target, height, memory = self._commands(
-            seen, state, self._nothing if memory is None else memory
-        )
+        target, height, memory = self._commands(images, state, memory)
         action = self._network.within_bounds(target, height)
         return action, self._network.commanded(memory, action)
+
+
+class CompiledFeatures:
+    """What an `HvsNetwork` that reads joints makes of an observation, for who acts on it himself.
+
+    Args:
+        network: In evaluation mode; later changes of its weights are not noticed.
+    """
+
+    def __init__(self, network: HvsNetwork) -> None:
+        self._features = _Compiled(_Features(network), network)
+
+    def __call__(
+        self, images: Mapping[str, Tensor], state: Tensor, memory: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Look, as `HvsNetwork.forward` does.
+
+        Args:
+            images: Camera name to (1, C, H, W), float in [0, 1].
+            state: Measured joints, (1, 14) or (1, 7).
+            memory: See `HvsNetwork.forward`.
+
+        Returns:
+            ``out``, ``features`` and ``memory`` of the `Decision`.
+        """
+        return self._features(images, state, memory)
+
+
+class _Compiled:
+    """A module on images, state and memory, traced and frozen for one observation at a time."""
+
+    def __init__(self, module: nn.Module, network: HvsNetwork) -> None:
+        self._cameras = tuple(network.shape.cameras)
+        sizes = network.shape.cameras.values()
+        images = tuple(torch.zeros(1, channels, side, side) for channels, side in sizes)
+        state = torch.zeros(1, network.shape.state_dim)
+        self._nothing = torch.zeros(1, memory_size(len(images)))
+        with torch.no_grad(), warnings.catch_warnings():
+            # Tracing holds for batches of one alone, which is all it is made for; and newer Python
+            # will want another compiler, which needs a C++ one installed.
+            warnings.simplefilter("ignore")
+            traced = torch.jit.trace(  # type: ignore[no-untyped-call]
+                module.eval(), (images, state, self._nothing), check_trace=False
+            )
+            # Not optimize_for_inference: its convolutions take twice as long on larger images.
+            self._frozen = torch.jit.freeze(traced)
+            for _ in range(_WARM_UP_CALLS):
+                self._frozen(images, state, self._nothing)
+
+    def __call__(
+        self, images: Mapping[str, Tensor], state: Tensor, memory: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        seen = tuple(images[name] for name in self._cameras)
+        result: tuple[Tensor, Tensor, Tensor] = self._frozen(
+            seen, state, self._nothing if memory is None else memory
+        )
+        return result
 
 
 class _Commands(nn.Module):
@@ -76,7 +116,31 @@ class _Commands(nn.Module):
         self, images: tuple[Tensor, ...], state: Tensor, memory: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Where to send the joints, how high that is, and the next memory."""
-        named = dict(zip(self._network.shape.cameras, images, strict=True))
-        decision = self._network(named, state, memory)
+        decision = _decision(self._network, images, state, memory)
         target = self._network.to_target(decision.out, state)
+        assert decision.memory is not None
         return target, geometry.flange_motion(target).position[:, 2:], decision.memory
+
+
+class _Features(nn.Module):
+    """What a decision is made of."""
+
+    def __init__(self, network: HvsNetwork) -> None:
+        super().__init__()
+        self._network = network
+
+    def forward(
+        self, images: tuple[Tensor, ...], state: Tensor, memory: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Output, features and the next memory."""
+        decision = _decision(self._network, images, state, memory)
+        assert decision.memory is not None
+        return decision.out, decision.features, decision.memory
+
+
+def _decision(
+    network: HvsNetwork, images: tuple[Tensor, ...], state: Tensor, memory: Tensor
+) -> Decision:
+    named = dict(zip(network.shape.cameras, images, strict=True))
+    decision: Decision = network(named, state, memory)
+    return decision

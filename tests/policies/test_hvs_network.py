@@ -10,7 +10,7 @@ import torch
 from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.cell.robot import JOINT_RANGE_RAD
 from hvs_suite.policies.hvs import geometry
-from hvs_suite.policies.hvs.compiled import CompiledNetwork
+from hvs_suite.policies.hvs.compiled import CompiledFeatures, CompiledNetwork
 from hvs_suite.policies.hvs.network import (
     FEATURE_SIZE,
     HvsNetwork,
@@ -194,13 +194,18 @@ def test_compiled_the_network_decides_as_before(names, state_dim):
     state[:, [1, 3, 5]] += torch.tensor([0.6, -1.4, 1.1])
     # Half of the postures are too low, so that both ways out are taken.
     net.lowest_goal.copy_(geometry.flange_motion(state[:, :7]).position[:, 2].median())
-    compiled, memory = CompiledNetwork(net), None
+    compiled, features, memory = CompiledNetwork(net), CompiledFeatures(net), None
     raised = []
     with torch.inference_mode():
         for i in range(len(state)):
             seen = {name: image[i : i + 1] for name, image in images.items()}
             decision = net(seen, state[i : i + 1], memory)
             expected = net.to_action(decision.out, state[i : i + 1])
+            made_of = features(seen, state[i : i + 1], memory)
+            for made, known in zip(
+                made_of, (decision.out, decision.features, decision.memory), strict=True
+            ):
+                torch.testing.assert_close(made, known, atol=1e-6, rtol=0.0)
             action, memory = compiled(seen, state[i : i + 1], memory)
             torch.testing.assert_close(action, expected, atol=1e-6, rtol=0.0)
             after = net.commanded(decision.memory, expected)
