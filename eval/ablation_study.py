@@ -266,9 +266,11 @@ def draw(study: Study) -> Any:
     axes = figure.subplots()
     colours = ["#16803c" if row.against is None else "#2b6cb0" for row in rows]
     axes.barh([row.name for row in rows], rates, xerr=ends, color=colours, capsize=3)
-    for place, rate in enumerate(rates):
-        axes.text(1.0, place, f"{rate:.1f} %", va="center", color="white", fontsize=8)
-    axes.set(xlim=(0.0, 100.0), xlabel="solved (%), with Wilson's 95 % interval")
+    for place, (rate, row) in enumerate(zip(rates, rows, strict=True)):
+        # Behind the interval, where there is room whatever the rate.
+        axes.text(row.ci95[1] + 1.5, place, f"{rate:.1f} %", va="center", fontsize=8)
+    axes.set(xlim=(0.0, 112.0), xticks=range(0, 101, 20))
+    axes.set_xlabel("solved (%), with Wilson's 95 % interval")
     axes.set_title(f"{study.task}: what each choice buys", fontsize=10, loc="left")
     axes.spines[["top", "right"]].set_visible(False)
     return figure
