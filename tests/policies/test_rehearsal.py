@@ -79,8 +79,8 @@ def test_it_teaches_the_head_and_leaves_the_eyes_alone(dataset, tmp_path):
         for name, parameter in policy.named_parameters()
         if parameter.grad is not None and parameter.grad.abs().max() > 0
     }
-    always = {"head", "step_gain", "stride_gain"}
-    assert always <= moved <= always | {"above_gain", "memory_trust"}
+    always = {"head", "step_gain", "stride_gain", "onward_step_gain", "onward_stride_gain"}
+    assert always <= moved <= always | {"above_gain", "memory_trust", "log_height_doubt"}
 
 
 def test_a_run_without_supervision_has_nothing_to_rehearse_on(dataset, tmp_path):
