@@ -166,17 +166,16 @@ def _sort(
             raise ResultError(f"the log of scenario {row.scenario} goes on after its end")
         truth = env.privileged()
         seen += any(truth[f"target_{camera}"][3] > 0.5 for camera in ("eih", "eth"))
+        executed = np.clip(action, spec.minimum, spec.maximum).astype(np.float32)
         if network is not None:
             with torch.inference_mode(), one_torch_thread():
                 decision = network(*network_inputs(network, time_step.observation), memory)
-            memory = decision.memory
+            if decision.memory is not None:
+                memory = network.commanded(decision.memory, torch.from_numpy(executed)[None])
             if decision.target is not None and decision.motion is not None:
                 _, flange = kinematics().flange_pose(env.joint_positions)
                 believed = (decision.target - decision.motion.position)[0].double().numpy()
                 off_mm = 1e3 * float(np.linalg.norm((believed - (target - flange))[:2]))
-        executed = np.clip(action, spec.minimum, spec.maximum).astype(np.float32)
-        if network is not None and memory is not None:
-            memory = network.commanded(memory, torch.from_numpy(executed)[None])
         time_step = env.step(executed)
         errors_mm.append(float(env.info["position_error_mm"]))
     return Failure(

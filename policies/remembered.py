@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
+from hvs_suite.cell.robot import JOINT_RANGE_RAD, set_point_after
 from hvs_suite.datasets.features import ACTION_EXECUTED
 from hvs_suite.policies.hvs.geometry import (
     Calibration,
@@ -142,13 +142,12 @@ def _height_sums(
 
 def _set_points(state: Column, executed: Column, first: Column) -> Column:
     """The set point that all actions before each frame lead to, (n, 7) rad."""
-    longest = JOINT_SPEED_RAD_S * CONTROL_PERIOD_S
     set_points = state[:, :N_JOINTS].astype(np.float64)
     number = np.arange(len(state)) - first
     for k in range(1, int(number.max(initial=0)) + 1):
         now = np.flatnonzero(number == k)
-        way = executed[now - 1] * JOINT_RANGE_RAD - set_points[now - 1]
-        set_points[now] = set_points[now - 1] + np.clip(way, -longest, longest)
+        asked = executed[now - 1] * JOINT_RANGE_RAD
+        set_points[now] = set_point_after(set_points[now - 1], asked, CONTROL_PERIOD_S)
     return set_points
 
 

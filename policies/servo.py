@@ -35,6 +35,7 @@ from hvs_suite.cell.robot import (
     JOINT_SPEED_RAD_S,
     SHOULDER_TO_ELBOW_M,
     WRIST_TO_FLANGE_M,
+    set_point_after,
 )
 from hvs_suite.datasets.expert import Expert
 from hvs_suite.errors import PolicyError
@@ -154,10 +155,9 @@ class Belief:
 
     def _tracked(self, commands: list[FloatArray]) -> FloatArray:
         assert self._start is not None
-        limit = JOINT_SPEED_RAD_S * self.variant.control_period_s
         set_point = self._start
         for command in commands:
-            set_point = set_point + np.clip(command - set_point, -limit, limit)
+            set_point = set_point_after(set_point, command, self.variant.control_period_s)
         return set_point
 
 

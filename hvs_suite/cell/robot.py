@@ -183,6 +183,21 @@ _LINKS: tuple[_Link, ...] = (
 """The base and links 1 to 7."""
 
 
+def set_point_after(set_point: FloatArray, command: FloatArray, period_s: float) -> FloatArray:
+    """Where the joint set point is a control step after a command: as near as the joints may go.
+
+    Args:
+        set_point: Before, (..., 7) rad.
+        command: Joint positions asked for, (..., 7) rad.
+        period_s: Length of the control step (s).
+
+    Returns:
+        (..., 7) rad.
+    """
+    longest = JOINT_SPEED_RAD_S * period_s
+    return np.asarray(set_point + np.clip(command - set_point, -longest, longest))
+
+
 def _add_capsules(body: Any, name: str, capsules: tuple[_Capsule, ...], conaffinity: int) -> None:
     """Adds the collision capsules of one link to its body."""
     for i, capsule in enumerate(capsules):

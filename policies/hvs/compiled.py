@@ -6,7 +6,7 @@ Traced once and frozen, it is one call of some six hundred.
 """
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +16,8 @@ from hvs_suite.policies.hvs.network import Decision, HvsNetwork, memory_size
 
 # TorchScript looks at what it runs before it settles how.
 _WARM_UP_CALLS = 3
+
+Says = Callable[[HvsNetwork, Decision, Tensor], tuple[Tensor, Tensor]]
 
 
 class CompiledNetwork:
@@ -27,7 +29,7 @@ class CompiledNetwork:
 
     def __init__(self, network: HvsNetwork) -> None:
         self._network = network
-        self._commands = _Compiled(_Commands(network), network)
+        self._commands = _Compiled(network, _commands)
 
     def __call__(
         self, images: Mapping[str, Tensor], state: Tensor, memory: Tensor | None
@@ -56,7 +58,7 @@ class CompiledFeatures:
     """
 
     def __init__(self, network: HvsNetwork) -> None:
-        self._features = _Compiled(_Features(network), network)
+        self._features = _Compiled(network, _features)
 
     def __call__(
         self, images: Mapping[str, Tensor], state: Tensor, memory: Tensor | None
@@ -75,9 +77,9 @@ class CompiledFeatures:
 
 
 class _Compiled:
-    """A module on images, state and memory, traced and frozen for one observation at a time."""
+    """A network that says two things of its decision, traced and frozen for one observation."""
 
-    def __init__(self, module: nn.Module, network: HvsNetwork) -> None:
+    def __init__(self, network: HvsNetwork, says: Says) -> None:
         self._cameras = tuple(network.shape.cameras)
         sizes = network.shape.cameras.values()
         images = tuple(torch.zeros(1, channels, side, side) for channels, side in sizes)
@@ -88,7 +90,7 @@ class _Compiled:
             # will want another compiler, which needs a C++ one installed.
             warnings.simplefilter("ignore")
             traced = torch.jit.trace(  # type: ignore[no-untyped-call]
-                module.eval(), (images, state, self._nothing), check_trace=False
+                _Decides(network, says).eval(), (images, state, self._nothing), check_trace=False
             )
             # Not optimize_for_inference: its convolutions take twice as long on larger images.
             self._frozen = torch.jit.freeze(traced)
@@ -105,42 +107,29 @@ class _Compiled:
         return result
 
 
-class _Commands(nn.Module):
-    """What of a decision holds no branch."""
+class _Decides(nn.Module):
+    """A network as tracing takes it: tensors in, tensors out, no branch."""
 
-    def __init__(self, network: HvsNetwork) -> None:
+    def __init__(self, network: HvsNetwork, says: Says) -> None:
         super().__init__()
         self._network = network
+        self._says = says
 
     def forward(
         self, images: tuple[Tensor, ...], state: Tensor, memory: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Where to send the joints, how high that is, and the next memory."""
-        decision = _decision(self._network, images, state, memory)
-        target = self._network.to_target(decision.out, state)
-        assert decision.memory is not None
-        return target, geometry.flange_motion(target).position[:, 2:], decision.memory
+        """Two things about the decision, and the next memory."""
+        named = dict(zip(self._network.shape.cameras, images, strict=True))
+        decision = self._network(named, state, memory)
+        return *self._says(self._network, decision, state), decision.memory
 
 
-class _Features(nn.Module):
-    """What a decision is made of."""
-
-    def __init__(self, network: HvsNetwork) -> None:
-        super().__init__()
-        self._network = network
-
-    def forward(
-        self, images: tuple[Tensor, ...], state: Tensor, memory: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Output, features and the next memory."""
-        decision = _decision(self._network, images, state, memory)
-        assert decision.memory is not None
-        return decision.out, decision.features, decision.memory
+def _commands(network: HvsNetwork, decision: Decision, state: Tensor) -> tuple[Tensor, Tensor]:
+    """Where to send the joints, and how high the flange is there."""
+    target = network.to_target(decision.out, state)
+    return target, geometry.flange_motion(target).position[:, 2:]
 
 
-def _decision(
-    network: HvsNetwork, images: tuple[Tensor, ...], state: Tensor, memory: Tensor
-) -> Decision:
-    named = dict(zip(network.shape.cameras, images, strict=True))
-    decision: Decision = network(named, state, memory)
-    return decision
+def _features(network: HvsNetwork, decision: Decision, state: Tensor) -> tuple[Tensor, Tensor]:
+    """The output, and what it was made of."""
+    return decision.out, decision.features

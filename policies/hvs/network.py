@@ -55,7 +55,7 @@ NEVER_LOGIT = -20.0
 """What cannot be in view at all: its weight is below a float's precision beside any other."""
 ESTIMATE_FEATURES = 7
 WAY_FEATURES = 2 * (N_JOINTS - 1) + 2
-"""Of `HvsNetwork._way`."""
+"""Of each of `HvsNetwork._ways`."""
 CONTROL_PERIOD_S = 0.1
 """Of all named tasks."""
 
@@ -459,15 +459,17 @@ class HvsNetwork(nn.Module):
         step = torch.asinh(geometry.joint_step(motion, goals[0] - motion.position) / scale)
         features += [torch.sin(q), torch.cos(q), q / self.joint_range]
         features += [motion.position, motion.rotation.flatten(1), step]
-        ways, strides = self._ways(q, goals)
-        features += ways
-        strides = [torch.asinh(each / scale) for each in strides]
+        ways = self._ways(q, goals)
+        for turns, time_s, within, each in ways:
+            features += [torch.asinh(turns / scale), time_s, within]
+            features.append(torch.asinh(each / scale)[:, :-1])
+        strides = [torch.asinh(each / scale) for *_, each in ways]
         # From where the arm is sent: it trails its set point, and may not even have begun to move.
         pending = set_point - q
         sent = geometry.flange_motion(set_point)
         onward_step = pending + geometry.joint_step(sent, goals[0] - sent.position)
         onward_step = torch.asinh(onward_step / scale)
-        onward = [torch.asinh((pending + each) / scale) for each in self._ways(set_point, goals)[1]]
+        onward = [torch.asinh((pending + w[-1]) / scale) for w in self._ways(set_point, goals)]
         later = [torch.asinh(pending / scale), onward_step, *onward]
         stride, onward_stride = strides[0], onward[0]
         if "eih" in sightings:
@@ -495,26 +497,23 @@ class HvsNetwork(nn.Module):
         out, known = self._with_residual(inputs, out)
         return Decision(out, known, sightings, target, remembered, motion)
 
-    def _ways(self, q: Tensor, goals: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
-        """What the head reads of the ways to plain postures over some goals.
+    def _ways(self, q: Tensor, goals: list[Tensor]) -> list[tuple[Tensor, ...]]:
+        """The ways to plain postures over some goals.
 
         Args:
-            q: Measured joint positions, (B, 7) rad.
+            q: Where they begin, (B, 7) rad.
             goals: Of the flange, (B, 3) m each.
 
         Returns:
-            For each goal, (B, 14): what is left of the turns of A1 to A6, its time (s), 1 if the
-            posture lies within the joint ranges, else 0, and the joint step that goes there, turns
-            and step on the logarithmic scale; and for each that step alone, (B, 7) rad, A7 at rest.
+            For each goal: what is left of the turns of A1 to A6, (B, 6) rad; its time, (B, 1) s; 1
+            if the posture lies within the joint ranges, else 0, (B, 1); and the joint step that
+            goes there, (B, 7) rad, A7 at rest.
         """
         n = len(goals)
         turns, time_s, within = geometry.way_to_posture(q.repeat(n, 1), torch.cat(goals))
         step = turns * (CONTROL_PERIOD_S / time_s.clamp(min=CONTROL_PERIOD_S))
-        scale = self.shape.error_scale
-        ways = torch.cat(
-            [torch.asinh(turns / scale), time_s, within, torch.asinh(step / scale)], dim=1
-        )
-        return list(ways.chunk(n)), list(F.pad(step, (0, 1)).chunk(n))
+        whole = (turns, time_s, within, F.pad(step, (0, 1)))
+        return list(zip(*(each.chunk(n) for each in whole), strict=True))
 
     def _look_out(self, q: Tensor, set_point: Tensor) -> Tensor:
         """The step to where a demonstrator looks for the target, each joint as fast as it can.
