@@ -14,7 +14,7 @@ class Finetune:
 
     Lets the policy play and trains its eyes on what it saw, then learns by TD3 what to add to its
     actions. No expert is asked. Trains for --minutes or --steps, whichever ends first, or for forty
-    minutes if neither is given; ends early and keeps the last good state if success falls.
+    minutes if neither is given; ends early if success falls, and keeps what was evaluated best.
     Interrupted, it goes on from its last checkpoint when the same command is given again. Curves
     and a film of each evaluation are in OUT/training.
 
@@ -35,8 +35,8 @@ class Finetune:
         noise: Standard deviation of the exploration, as a share of the bound.
         actor_rate: Learning rate of what is added.
         penalty: Weight of the squared share of the bound that is used.
-        updates: Updates after every 40 environment steps; four times as many while the critics
-            learn alone.
+        updates: Updates while 40 environment steps are played; four times as many while the
+            critics learn alone.
         eval_every: Environment steps between evaluations; one more comes at start and end.
         eval_episodes: Episodes an evaluation, on scenes of a split of their own.
     """

@@ -3,9 +3,10 @@
 What differs from its TD3: actor and critics read their own keys of the observation, and critics
 where an action leads in place of the action (docs/experiments/foresight.md); the critics are an
 ensemble with layer norm of which two, drawn anew for each update, make the target (RLPD: Ball et
-al., 2023, https://arxiv.org/abs/2302.02948); the actor stands still while they warm up; and it is
+al., 2023, https://arxiv.org/abs/2302.02948); the actor stands still while they warm up; it is
 held to the base by a penalty against the normalised value, as in TD3+BC (Fujimoto and Gu, 2021,
-https://arxiv.org/abs/2106.06860).
+https://arxiv.org/abs/2106.06860); its target follows more slowly than theirs, because it is what
+plays in the end: an average over many updates; and updates are made while the environments play.
 """
 
 from collections.abc import Iterable
@@ -17,6 +18,7 @@ from gymnasium import spaces
 from stable_baselines3 import TD3
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import TrainFreq
 from stable_baselines3.common.utils import polyak_update
 from stable_baselines3.td3.policies import Actor, MultiInputPolicy
 from torch import Tensor, nn
@@ -130,15 +132,29 @@ class ResidualTD3(TD3):
 
     Attributes:
         actor_rate: Learning rate of the actor; that of SB3 is the critics'.
+        actor_tau: Share of the actor that goes into its target; that of SB3 is the critics'.
+        updates: Updates while `train_freq` steps are played, spread over them.
         warm_up_steps: Environment steps in which the critics learn alone.
         penalty: Weight of the squared action against the normalised value.
         bound: The most that an action of 1 adds to the base; noted here for who folds it in.
     """
 
     actor_rate: float
+    actor_tau: float
+    updates: int
     warm_up_steps: int
     penalty: float
     bound: float
+
+    def learn_meanwhile(self) -> None:
+        """The updates that fall to a step of the environments, made while these play it."""
+        memory, steps = self.replay_buffer, self.train_freq
+        assert memory is not None
+        assert isinstance(steps, TrainFreq)
+        begun = self.num_timesteps // self.n_envs % steps.frequency
+        due, done = (self.updates * part // steps.frequency for part in (begun + 1, begun))
+        if due > done and memory.size():
+            self.train(due - done, self.batch_size)
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """Update critics, and actor once they have warmed up; SB3's interface."""
@@ -149,7 +165,6 @@ class ResidualTD3(TD3):
         assert self.replay_buffer is not None
         assert isinstance(self.critic_target, ForesightedCritic)
         frees_actor = self.num_timesteps >= self.warm_up_steps
-        critic_losses, actor_losses, sizes, values = [], [], [], []
         for _ in range(gradient_steps if frees_actor else WARM_UP_UPDATES * gradient_steps):
             self._n_updates += 1
             data: Any = self.replay_buffer.sample(batch_size)
@@ -166,8 +181,8 @@ class ResidualTD3(TD3):
             self.critic.optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             self.critic.optimizer.step()
-            critic_losses.append(loss.item())
-            values.append(estimates.mean().item())
+            self.logger.record_mean("train/critic_loss", loss.item())
+            self.logger.record_mean("train/value", estimates.mean().item())
             polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
             if frees_actor and self._n_updates % self.policy_delay == 0:
                 action = self.actor(data.observations)
@@ -178,19 +193,12 @@ class ResidualTD3(TD3):
                 self.actor.optimizer.zero_grad()
                 loss.backward()
                 self.actor.optimizer.step()
-                polyak_update(self.actor.parameters(), self.actor_target.parameters(), self.tau)
-                actor_losses.append(loss.item())
-                sizes.append(size.item() ** 0.5)
-        self.logger.record("train/critic_loss", _mean(critic_losses))
-        self.logger.record("train/value", _mean(values))
-        if actor_losses:
-            self.logger.record("train/actor_loss", _mean(actor_losses))
-            self.logger.record("train/residual", _mean(sizes))
+                polyak_update(
+                    self.actor.parameters(), self.actor_target.parameters(), self.actor_tau
+                )
+                self.logger.record_mean("train/actor_loss", loss.item())
+                self.logger.record_mean("train/residual", size.item() ** 0.5)
 
 
 def _extracted(keys: Keys) -> dict[str, Any]:
     return {"features_extractor": keys, "features_dim": keys.features_dim}
-
-
-def _mean(values: list[float]) -> float:
-    return sum(values) / len(values)

@@ -18,12 +18,14 @@ class Settings:
         actor_rate: Learning rate of the residual.
         critic_rate: Learning rate of the critics.
         batch_size: Transitions an update.
-        tau: Share of the networks that goes into their targets after an update.
+        tau: Share of the critics that goes into their targets after an update.
+        actor_tau: Share of the actor that goes into its target, which is what plays in the end.
         gamma: Discount; below 1 it also pays for haste.
         replay_size: Transitions kept.
         warm_up_steps: Environment steps in which the critics learn alone.
         collect_steps: Environment steps an iteration.
-        updates: Updates after an iteration; four times as many while the critics learn alone.
+        updates: Updates an iteration, made while its steps are played; four times as many while
+            the critics learn alone.
         noise: Standard deviation of the exploration, as a share of the bound.
         target_noise: Standard deviation of the noise on the target's actions, likewise.
         bound: The most that the residual adds to the head's output.
@@ -43,6 +45,7 @@ class Settings:
     critic_rate: float = 3e-4
     batch_size: int = 256
     tau: float = 0.02
+    actor_tau: float = 0.005
     gamma: float = 0.97
     replay_size: int = 200_000
     warm_up_steps: int = 2_000
@@ -53,7 +56,7 @@ class Settings:
     bound: float = RESIDUAL_BOUND
     penalty: float = 0.1
     critics: int = 4
-    hidden: int = 256
+    hidden: int = 128
     shaping: float = 0.05
     eye_rounds: int = 2
     eye_frames: int = 6_000
@@ -67,7 +70,7 @@ class Settings:
         Raises:
             OptionError: One of them does not.
         """
-        for name in ("actor_rate", "critic_rate", "eye_rate", "tau", "gamma"):
+        for name in ("actor_rate", "critic_rate", "eye_rate", "tau", "actor_tau", "gamma"):
             value = getattr(self, name)
             if not (math.isfinite(value) and 0.0 < value <= 1.0):
                 raise OptionError(f"{name} must be above 0 and at most 1, not {value}")

@@ -20,7 +20,6 @@ import numpy as np
 import torch
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 from hvs_suite.policies.allocator import keep_freed_memory
 from hvs_suite.policies.checkpoint import (
@@ -31,6 +30,7 @@ from hvs_suite.policies.checkpoint import (
 )
 from hvs_suite.policies.finetune.eyes import train_eyes
 from hvs_suite.policies.finetune.folding import load_base, with_residual, write_folded
+from hvs_suite.policies.finetune.meanwhile import MeanwhileHere, MeanwhileThere
 from hvs_suite.policies.finetune.outlook import Outlook
 from hvs_suite.policies.finetune.residual_td3 import ResidualPolicy, ResidualTD3
 from hvs_suite.policies.finetune.settings import Settings
@@ -142,6 +142,9 @@ def finetune(
         base = train_eyes(
             policy, training / "eyes", variant, options, split, seed, settings, examine, on_eyes
         )
+        if settings.environments > 1:
+            # They and the learner play and learn at the same time.
+            torch.set_num_threads(1)
         environments = _environments(MakeStage(task, options, levels, split, base, settings, seed))
         stack.callback(environments.close)
         model = _make_model(environments, load_base(base), settings, seed)
@@ -191,19 +194,19 @@ class MakeStage:
         return Journal(stage, self.seed, self.part, settings.environments)
 
 
-def _environments(make: MakeStage) -> VecEnv:
+def _environments(make: MakeStage) -> MeanwhileHere | MeanwhileThere:
     """All environments of a run: a process each, or this one for a single one."""
     parts = [dataclasses.replace(make, part=i) for i in range(make.settings.environments)]
     if len(parts) == 1:
-        return DummyVecEnv([*parts])
+        return MeanwhileHere([*parts])
     with worker_conditions():
-        return SubprocVecEnv([*parts], start_method="spawn")
+        return MeanwhileThere([*parts], start_method="spawn")
 
 
 class _Finetuned:
     """The run's model as `Run` takes it, and the checkpoint that comes of it."""
 
-    stops_when_fallen = True
+    guards_success = True
 
     def __init__(self, model: ResidualTD3, base: Path, out: Path, variant: AlignVariant) -> None:
         self.model = model
@@ -218,7 +221,7 @@ class _Finetuned:
         """Fold the residual into a checkpoint, and play that."""
         residual = self._network.residual
         assert residual is not None
-        residual.load_state_dict(self.model.actor.mu.state_dict())
+        residual.load_state_dict(self.model.actor_target.mu.state_dict())
         write_folded(self._base, self._network, self._candidate)
         return CheckpointPolicy(self._candidate, self._variant)
 
@@ -230,7 +233,7 @@ class _Finetuned:
 
 
 def _make_model(
-    environments: VecEnv, base: HvsNetwork, settings: Settings, seed: int
+    environments: MeanwhileHere | MeanwhileThere, base: HvsNetwork, settings: Settings, seed: int
 ) -> ResidualTD3:
     sigma = np.full(N_JOINTS, settings.noise)
     model = ResidualTD3(
@@ -244,7 +247,8 @@ def _make_model(
         tau=settings.tau,
         gamma=settings.gamma,
         train_freq=(settings.collect_steps // settings.environments, "step"),
-        gradient_steps=settings.updates,
+        # None after the steps: they are made meanwhile.
+        gradient_steps=0,
         action_noise=NormalActionNoise(np.zeros(N_JOINTS), sigma),
         # A time limit is a failure, and critics see it coming: nothing is worth anything beyond.
         replay_buffer_kwargs={"handle_timeout_termination": False},
@@ -260,7 +264,10 @@ def _make_model(
         device="cpu",
     )
     model.actor_rate = settings.actor_rate
+    model.actor_tau = settings.actor_tau
+    model.updates = settings.updates
     model.warm_up_steps = settings.warm_up_steps
     model.penalty = settings.penalty
     model.bound = settings.bound
+    environments.meanwhile = model.learn_meanwhile
     return model

@@ -151,6 +151,18 @@ def write_evaluations(path: Path, evaluations: list[Evaluation]) -> None:
         temporary.write_text(json.dumps(rows, indent=2) + "\n")
 
 
+def standing(evaluation: Evaluation) -> tuple[float, float]:
+    """What evaluations of the same scenes are compared by: success, and of equals haste.
+
+    Args:
+        evaluation: Of some state of a run.
+
+    Returns:
+        More is better.
+    """
+    return evaluation.success_rate, -evaluation.length
+
+
 def fallen(evaluations: Sequence[Evaluation]) -> bool:
     """Whether the last evaluation is worse than an earlier one beyond chance.
 

@@ -23,6 +23,7 @@ from hvs_suite.policies.rl.evaluation import (
     Examiner,
     fallen,
     read_evaluations,
+    standing,
     write_evaluations,
 )
 from hvs_suite.policies.rl.journal import OUTCOMES
@@ -39,11 +40,11 @@ class Learner(Protocol):
     """What the algorithms differ in.
 
     Attributes:
-        stops_when_fallen: End the run where success has fallen below what it was, keeping what
-            plays as it was before.
+        guards_success: What plays is what was evaluated best so far, see `standing`, not what was
+            last; and the run ends where success has fallen.
     """
 
-    stops_when_fallen: bool
+    guards_success: bool
 
     @property
     def model(self) -> Model:
@@ -273,10 +274,10 @@ class Run:
         )
 
     def _has_fallen(self) -> bool:
-        return self._learner.stops_when_fallen and fallen(self._evaluations)
+        return self._learner.guards_success and fallen(self._evaluations)
 
     def _evaluate(self) -> None:
-        """Play greedily, film scene 0, keep the figures, and the policy if it is good."""
+        """Play greedily, film scene 0, keep the figures, and the policy if it is to be kept."""
         env_steps = self._model.num_timesteps
         evaluation = self._examiner.evaluate(
             self._learner.policy(),
@@ -288,7 +289,8 @@ class Run:
         self._evaluations.append(evaluation)
         write_evaluations(self._training / "evaluations.json", self._evaluations)
         self._curves.add({f"eval/{k}": v for k, v in evaluation.figures().items()}, env_steps)
-        if not self._has_fallen():
+        best = max(standing(each) for each in self._evaluations)
+        if not self._learner.guards_success or standing(evaluation) == best:
             self._learner.keep()
 
     def _checkpoint(self) -> None:

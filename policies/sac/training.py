@@ -123,7 +123,7 @@ def train_sac(
 class _Sac:
     """SAC as `Run` takes it."""
 
-    stops_when_fallen = False
+    guards_success = False
 
     def __init__(self, out: Path, model: SAC) -> None:
         self.model = model

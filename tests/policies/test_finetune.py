@@ -209,8 +209,8 @@ def test_critics_warm_up_before_the_actor_moves(base, tmp_path):
 def test_a_run_is_evaluated_before_it_learns_and_counts_what_it_did(whole):
     out, outcome, reports = whole
     assert outcome.env_steps == STEPS
-    # The first iteration falls into the warm-up.
-    assert outcome.step == 2 * (WARM_UP_UPDATES + STEPS // 6 - 1)
+    # The first two iterations are the warm-up.
+    assert outcome.step == 2 * (2 * WARM_UP_UPDATES + STEPS // 6 - 2)
     stages = [report.stage for report in reports]
     order = ("evaluating", "looking", "training eyes", "training")
     assert sorted(order, key=stages.index) == list(order)
@@ -325,6 +325,16 @@ def test_a_run_whose_success_falls_ends_and_keeps_what_it_had(base, tmp_path, mo
     # Given again, the same command does not go on where it was ended.
     again = finetune(base, "align-easy", tmp_path / "out", steps=STEPS, **call)
     assert again.env_steps == 18
+
+
+@pytest.mark.parametrize(("success", "moves"), [(0.89, False), (0.9, True), (0.95, True)])
+def test_what_plays_is_what_was_evaluated_best(base, tmp_path, monkeypatch, success, moves):
+    # Without eyes: where RL begins, and where it has led.
+    pretend(monkeypatch, [0.9, success])
+    settings = dataclasses.replace(SMALL, eye_rounds=0, warm_up_steps=6)
+    finetune(base, "align-easy", tmp_path / "out", steps=18, **{**CALL, "settings": settings})
+    weights = load_file(tmp_path / "out" / "model.safetensors")
+    assert weights["network.residual.6.weight"].any().item() is moves
 
 
 @pytest.mark.parametrize(
