@@ -96,6 +96,7 @@ def describe(
         "inputs": inputs,
         "output": "`action` 7: joint position targets in units of the joint range",
         **(_rl_rows if was_fine_tuned else _imitation_rows)(settings, outcome),
+        "time": _time(outcome, trained["threads"], was_fine_tuned),
         "seed": str(settings["seed"]),
         "licence": LICENCE,
     }
@@ -128,7 +129,6 @@ def _imitation_rows(settings: Mapping[str, Any], outcome: Mapping[str, Any]) -> 
     """What `pretrain` did."""
     rounds = outcome["rounds"]
     corrected = sum(played["frames"] for played in rounds)
-    hours = (outcome["train_s"] + outcome["play_s"]) / 3600.0
     return {
         "parameters": f"{outcome['n_parameters']:,}",
         "demonstrations": "of the suite's expert",
@@ -137,7 +137,6 @@ def _imitation_rows(settings: Mapping[str, Any], outcome: Mapping[str, Any]) -> 
         if rounds
         else "none",
         "optimiser steps": f"{outcome['step']:,} of {settings['batch_size']} frames",
-        "time": f"{hours:.2f} h on two cores, recording not counted",
         "supervision in training": "the expert's action, and where the target is "
         "(`privileged.*`); neither is an input"
         if settings["keypoint_weight"] > 0
@@ -154,11 +153,17 @@ def _rl_rows(settings: Mapping[str, Any], outcome: Mapping[str, Any]) -> dict[st
         "reinforcement learning": f"TD3 on a residual of {outcome['n_parameters']:,} parameters, "
         f"{outcome['env_steps']:,} environment steps, {outcome['step']:,} updates of "
         f"{settings['batch_size']} transitions",
-        "time": f"{outcome['train_s'] / 3600.0:.2f} h on two cores, eyes and evaluations not "
-        "counted",
         "supervision in training": "the task's sparse reward, critics that see the simulator's "
         "state, and for the eyes where the target is; no expert, and none of it is an input",
     }
+
+
+def _time(outcome: Mapping[str, Any], threads: int, was_fine_tuned: bool) -> str:
+    """Hours of playing and learning; imitation counts its playing apart."""
+    hours = (outcome["train_s"] + outcome.get("play_s", 0.0)) / 3600.0
+    learning = "one thread" if threads == 1 else f"{threads} threads"
+    left_out = "eyes and evaluations" if was_fine_tuned else "recording"
+    return f"{hours:.2f} h, learning on {learning}; {left_out} not counted"
 
 
 def _results(results: list[Mapping[str, Any]]) -> list[str]:

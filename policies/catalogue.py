@@ -71,6 +71,19 @@ def checkpoint_folder(spec: str, task: str) -> Path:
     raise PolicyError(f"{spec!r} is neither a policy nor a checkpoint folder; {hint}")
 
 
+def name_of(folder: Path) -> str:
+    """A checkpoint's folder as notes have it: shipped weights lie elsewhere on each machine.
+
+    Args:
+        folder: As `checkpoint_folder` gives it.
+
+    Returns:
+        Such as ``pretrained/align-thesis``, or the folder as it is.
+    """
+    shipped = folder.resolve().is_relative_to(HERE)
+    return folder.resolve().relative_to(HERE).as_posix() if shipped else str(folder)
+
+
 def _builtin(name: str) -> PolicyFactory:
     if name == "expert":
         from hvs_suite.datasets.expert import make_expert

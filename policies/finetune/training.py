@@ -22,6 +22,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
 
 from hvs_suite.policies.allocator import keep_freed_memory
+from hvs_suite.policies.catalogue import name_of
 from hvs_suite.policies.checkpoint import (
     CheckpointPolicy,
     check_fit,
@@ -117,7 +118,7 @@ def finetune(
     }
     claim(out, identity)
     budget = {"minutes": minutes, "steps": steps}
-    write_train_config(out, identity, budget, PACKAGES, policy=str(policy))
+    write_train_config(out, identity, budget, PACKAGES, policy=name_of(policy))
     training = out / "training"
 
     def on_eyes(stage: str, share: float) -> None:

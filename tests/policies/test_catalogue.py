@@ -81,6 +81,12 @@ def test_what_does_not_exist_says_so_in_one_line(spec, tmp_path, monkeypatch):
     assert "\n" not in str(error.value)
 
 
+def test_notes_name_shipped_weights_wherever_they_lie(tmp_path):
+    shipped = catalogue.checkpoint_folder("pretrained", "align-easy")
+    assert catalogue.name_of(shipped) == "pretrained/align-thesis"
+    assert catalogue.name_of(tmp_path) == str(tmp_path)
+
+
 def test_a_name_nearly_right_is_suggested():
     with pytest.raises(PolicyError, match="did you mean expert"):
         policy_factory("exprt", "align-easy")

@@ -12,7 +12,12 @@ from hvs_suite.rollout import rollout
 
 ROOM = Path(catalogue.HERE)
 RESULTS = Path(__file__).parents[2] / "eval" / "results"
-TASKS = [task for task in hvs_suite.TASKS if (ROOM / "pretrained" / trained_on(task)).is_dir()]
+SHIPPED = [
+    (kind, task)
+    for kind in catalogue.SHIPPED
+    for task in hvs_suite.TASKS
+    if (ROOM / kind / trained_on(task)).is_dir()
+]
 
 
 class Load:
@@ -25,8 +30,8 @@ class Load:
         return hvs_suite.load(self.task, split="dev")
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_shipped_weights_solve_scenes_that_nobody_trained_on(task):
+@pytest.mark.parametrize(("kind", "task"), SHIPPED)
+def test_shipped_weights_solve_scenes_that_nobody_trained_on(kind, task):
     make = catalogue.policy_factory("pretrained", task)
     episodes = rollout(Load(task), make, range(5))
     assert sum(episode.success for episode in episodes) >= 4
@@ -35,10 +40,10 @@ def test_shipped_weights_solve_scenes_that_nobody_trained_on(task):
         assert not any(episode.collision for episode in episodes)
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_the_board_and_the_card_speak_of_these_weights(task):
-    folder = ROOM / "pretrained" / trained_on(task)
-    result = result_file.load(RESULTS / "pretrained" / f"{task}.json")
+@pytest.mark.parametrize(("kind", "task"), SHIPPED)
+def test_the_board_and_the_card_speak_of_these_weights(kind, task):
+    folder = ROOM / kind / trained_on(task)
+    result = result_file.load(RESULTS / kind / f"{task}.json")
     assert result.metadata.policy_hash == provenance.checkpoint_hash(folder)
     summary = result.summary
     row = f"| `{task}` | `test` | {summary.n_success:,} of {summary.n_episodes:,}"
