@@ -13,7 +13,7 @@ demo: .venv/.up-to-date  ## record, learn, score and film, in runs/demo (under 1
 	@.venv/bin/hvs demo --out runs/demo --overwrite
 
 TASK ?= align-thesis
-reproduce: .venv/.up-to-date  ## record, pretrain and evaluate TASK's shipped policy anew, in runs/
+reproduce: .venv/.up-to-date  ## record, pretrain, fine-tune and evaluate TASK's shipped policy anew, in runs/
 	@.venv/bin/hvs reproduce --task $(TASK)
 
 test: lint  ## ruff, mypy and every behaviour once (under 15 minutes)
