@@ -1,4 +1,4 @@
-"""A picture of an RL run: success amid training, and what learned it."""
+"""A picture of an RL run: success and haste amid training, and what learned them."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -33,8 +33,8 @@ def draw_rl_run(training: Path, evaluations: Sequence[Evaluation]) -> Path:
     from matplotlib.figure import Figure
 
     curves = read_curves(training / "tensorboard")
-    figure = Figure(figsize=(11.0, 3.6), layout="constrained")
-    success, playing, learning = figure.subplots(1, 3)
+    figure = Figure(figsize=(13.0, 3.4), layout="constrained")
+    success, haste, playing, learning = figure.subplots(1, 4)
     steps = [each.env_steps / 1000.0 for each in evaluations]
     rates = [100.0 * each.success_rate for each in evaluations]
     ranges = [
@@ -48,6 +48,10 @@ def draw_rl_run(training: Path, evaluations: Sequence[Evaluation]) -> Path:
     )  # fmt: skip
     success.set(ylim=(0.0, 102.0), ylabel="solved (%), with Wilson's 95 % interval")
     success.set_title(f"evaluations, {evaluations[-1].episodes} episodes each")
+    lengths = [each.length for each in evaluations]
+    haste.plot(steps, lengths, color="tab:green", marker="o", markersize=3, linewidth=1.2)
+    haste.set(ylabel="control steps, mean")
+    haste.set_title("length of their episodes")
     for name, label in ROLLOUT.items():
         if name in curves:
             playing.plot(
@@ -59,7 +63,7 @@ def draw_rl_run(training: Path, evaluations: Sequence[Evaluation]) -> Path:
         if name in curves:
             learning.plot(curves[name][0] / 1000.0, curves[name][1], label=label, linewidth=1.2)
     learning.set_title("learning")
-    for axes in (success, playing, learning):
+    for axes in (success, haste, playing, learning):
         axes.set_xlabel("environment steps (thousands)")
         axes.grid(alpha=0.3)
     for axes in (playing, learning):
