@@ -9,7 +9,7 @@ through the kinematics.
 import torch
 from torch import Tensor
 
-from hvs_suite.policies.finetune.stage import GOAL, JOINTS, NORMAL
+from hvs_suite.policies.finetune.stage import GOAL, JOINTS, NORMAL, SENT
 from hvs_suite.policies.hvs import geometry
 from hvs_suite.policies.hvs.network import CONTROL_PERIOD_S, N_JOINTS, HvsNetwork
 
@@ -19,7 +19,10 @@ FINE = 25.0
 
 
 class Outlook:
-    """Errors after a control step that brings the joints where they are told to go.
+    """Errors where the set point goes by a command, once the joints have come there.
+
+    The set point moves as fast as the joints may, from where all commands so far have sent it. With
+    latency that is a step or two ahead of the arm.
 
     Args:
         network: The base.
@@ -45,8 +48,8 @@ class Outlook:
         network = self._network
         longest = network.joint_speed * CONTROL_PERIOD_S
         step = network.to_step(features[:, -N_JOINTS:] + self._bound * action)
-        joints = privileged[:, JOINTS] * network.joint_range
-        motion = geometry.flange_motion(joints + step.clamp(-longest, longest))
+        joints, sent = (privileged[:, which] * network.joint_range for which in (JOINTS, SENT))
+        motion = geometry.flange_motion(sent + (joints + step - sent).clamp(-longest, longest))
         way = privileged[:, GOAL] - motion.position
         turn = torch.linalg.cross(motion.rotation[:, :, 2], -privileged[:, NORMAL], dim=1)
         # Where the length is 0 the norm has no slope.
