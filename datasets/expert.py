@@ -194,8 +194,7 @@ class Expert:
         q, velocity = env.joint_positions, env.joint_velocities
         set_point = env.setpoint
         for queued in env.pending_setpoints:
-            limit = robot.JOINT_SPEED_RAD_S * self._period_s
-            arrived = set_point + np.clip(queued - set_point, -limit, limit)
+            arrived = robot.set_point_after(set_point, queued, self._period_s)
             trail = _LAG_S * (arrived - set_point) / self._period_s
             q = arrived - trail + (q - set_point + trail) * self._decay
             velocity = (arrived - q) / _LAG_S

@@ -80,8 +80,8 @@ def name_of(folder: Path) -> str:
     Returns:
         Such as ``pretrained/align-thesis``, or the folder as it is.
     """
-    shipped = folder.resolve().is_relative_to(HERE)
-    return folder.resolve().relative_to(HERE).as_posix() if shipped else str(folder)
+    place = folder.resolve()
+    return place.relative_to(HERE).as_posix() if place.is_relative_to(HERE) else str(folder)
 
 
 def _builtin(name: str) -> PolicyFactory:

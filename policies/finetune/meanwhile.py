@@ -2,39 +2,29 @@
 
 from collections.abc import Callable
 
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 
-def _nothing() -> None:
-    """What is done meanwhile before anyone has said what."""
-
-
-class MeanwhileHere(DummyVecEnv):
-    """One environment, in this process: it plays after what is done meanwhile.
+class Meanwhile(VecEnv):
+    """What both kinds have in common.
 
     Attributes:
-        meanwhile: Called once a step, between action and result.
+        meanwhile: Called once a step, between action and result; None before anyone has said what.
     """
 
-    meanwhile: Callable[[], None] = staticmethod(_nothing)
+    meanwhile: Callable[[], None] | None = None
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Call it, then play; SB3's interface."""
-        self.meanwhile()
-        return super().step_wait()
+        """Call it, then wait for the result; SB3's interface."""
+        if self.meanwhile is not None:
+            self.meanwhile()
+        return super().step_wait()  # type: ignore[safe-super]
 
 
-class MeanwhileThere(SubprocVecEnv):
-    """Environments in processes of their own, which play during what is done meanwhile.
+class MeanwhileHere(Meanwhile, DummyVecEnv):
+    """One environment, in this process: it plays after what is done meanwhile."""
 
-    Attributes:
-        meanwhile: Called once a step, between action and result.
-    """
 
-    meanwhile: Callable[[], None] = staticmethod(_nothing)
-
-    def step_wait(self) -> VecEnvStepReturn:
-        """Call it while they play, then wait for them; SB3's interface."""
-        self.meanwhile()
-        return super().step_wait()
+class MeanwhileThere(Meanwhile, SubprocVecEnv):
+    """Environments in processes of their own, which play during what is done meanwhile."""

@@ -31,7 +31,7 @@ from hvs_suite.policies.checkpoint import (
 )
 from hvs_suite.policies.finetune.eyes import train_eyes
 from hvs_suite.policies.finetune.folding import load_base, with_residual, write_folded
-from hvs_suite.policies.finetune.meanwhile import MeanwhileHere, MeanwhileThere
+from hvs_suite.policies.finetune.meanwhile import Meanwhile, MeanwhileHere, MeanwhileThere
 from hvs_suite.policies.finetune.outlook import Outlook
 from hvs_suite.policies.finetune.residual_td3 import ResidualPolicy, ResidualTD3
 from hvs_suite.policies.finetune.settings import Settings
@@ -195,7 +195,7 @@ class MakeStage:
         return Journal(stage, self.seed, self.part, settings.environments)
 
 
-def _environments(make: MakeStage) -> MeanwhileHere | MeanwhileThere:
+def _environments(make: MakeStage) -> Meanwhile:
     """All environments of a run: a process each, or this one for a single one."""
     parts = [dataclasses.replace(make, part=i) for i in range(make.settings.environments)]
     if len(parts) == 1:
@@ -234,7 +234,7 @@ class _Finetuned:
 
 
 def _make_model(
-    environments: MeanwhileHere | MeanwhileThere, base: HvsNetwork, settings: Settings, seed: int
+    environments: Meanwhile, base: HvsNetwork, settings: Settings, seed: int
 ) -> ResidualTD3:
     sigma = np.full(N_JOINTS, settings.noise)
     model = ResidualTD3(

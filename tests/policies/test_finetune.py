@@ -162,10 +162,13 @@ def test_critics_see_where_a_command_leads(base, latency):
     ahead = Outlook(load_base(base), 0.6)
     foreseen, came = [], []
     for _ in range(4 + latency):
-        action = np.full(7, 0.3, np.float32)
-        # The base has hardly learned anything; one that goes fast says a quarter of a radian.
-        dev._out = torch.full((1, 7), 3.0)
-        seen[FEATURES][-7:] = 3.0
+        action = np.zeros(7, np.float32)
+        action[1] = 0.3
+        # The base has hardly learned anything; one that turns A2 fast says a quarter of a radian.
+        said = torch.zeros(1, 7)
+        said[0, 1] = 3.0
+        dev._out = said
+        seen[FEATURES][-7:] = said[0].numpy()
         batch = [
             torch.from_numpy(each)[None] for each in (seen[FEATURES], seen[PRIVILEGED], action)
         ]
@@ -180,7 +183,7 @@ def test_critics_see_where_a_command_leads(base, latency):
     led, went = led[: len(led) - latency], went[latency:]
     # The arm trails its set point a little; who foresaw nothing would be off by the whole way.
     astray, way = (led - went)[1:].norm(dim=1), went.diff(dim=0).norm(dim=1)
-    assert way.mean() > 0.05
+    assert way.mean() > 0.1
     assert astray.mean() < 0.4 * way.mean()
 
 

@@ -32,7 +32,7 @@ class Load:
 
 @pytest.mark.parametrize(("kind", "task"), SHIPPED)
 def test_shipped_weights_solve_scenes_that_nobody_trained_on(kind, task):
-    make = catalogue.policy_factory("pretrained", task)
+    make = catalogue.policy_factory(kind, task)
     episodes = rollout(Load(task), make, range(5))
     assert sum(episode.success for episode in episodes) >= 4
     # Amid disturbances a few are lost that way: the board says how many.
