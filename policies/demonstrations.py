@@ -274,7 +274,7 @@ class Demonstrations(FramePool):
         columns = _read_columns(manifest)
         calibration = None
         if {STATE, GOAL_POSITION, GOAL_NORMAL} <= set(columns):
-            calibration = _calibrate(manifest, columns)
+            calibration = _calibrate(manifest, columns, episodes)
         super().__init__(manifest, seed, calibration)
         images: dict[str, Frames] = {}
         for name, shape in manifest.cameras.items():
@@ -306,11 +306,12 @@ class Demonstrations(FramePool):
         self.training = np.concatenate([self.training, np.arange(start, len(self))])
 
 
-def calibration_of(root: Path) -> Calibration:
+def calibration_of(root: Path, episodes: int | None = None) -> Calibration:
     """Fit the camera maps of the `hvs` network to a dataset's privileged columns.
 
     Args:
         root: The dataset.
+        episodes: Fit them to the first so many episodes alone; None to all.
 
     Returns:
         The calibration.
@@ -323,11 +324,14 @@ def calibration_of(root: Path) -> Calibration:
     missing = {STATE, GOAL_POSITION, GOAL_NORMAL} - set(columns)
     if missing:
         raise DatasetError(f"{root} lacks {', '.join(sorted(missing))}")
-    return _calibrate(manifest, columns)
+    return _calibrate(manifest, columns, episodes)
 
 
-def _calibrate(manifest: Manifest, columns: Mapping[str, Column]) -> Calibration:
-    double = {key: column.astype(np.float64) for key, column in columns.items()}
+def _calibrate(
+    manifest: Manifest, columns: Mapping[str, Column], episodes: int | None
+) -> Calibration:
+    known = np.isin(columns[EPISODE], np.unique(columns[EPISODE])[:episodes])
+    double = {key: column[known].astype(np.float64) for key, column in columns.items()}
     return calibrate(
         q=double[STATE][:, :N_JOINTS],
         goal_position=double[GOAL_POSITION],

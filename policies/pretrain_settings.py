@@ -91,7 +91,7 @@ def tightest_scale(manifest: Manifest) -> float:
 
 
 def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":
-    """A fresh policy for a dataset's inputs, its cameras calibrated from the dataset.
+    """A fresh policy for a dataset's inputs, its cameras calibrated from what it is to learn from.
 
     Args:
         manifest: Of the dataset, with the inputs that the policy is to have.
@@ -123,7 +123,7 @@ def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":
         torch.manual_seed(settings.seed)
         policy = HvsPolicy(config)
     if STATE in manifest.features:
-        policy.network.set_calibration(calibration_of(manifest.root))
+        policy.network.set_calibration(calibration_of(manifest.root, settings.episodes))
     for module in policy.modules():
         if isinstance(module, Eye):
             module.train_in_bfloat16 = torch.cpu._is_avx512_bf16_supported()

@@ -12,7 +12,7 @@ from PIL import Image
 from safetensors.torch import load_file
 
 from hvs_suite.errors import DatasetError, OptionError, OutputError, PolicyError
-from hvs_suite.policies.demonstrations import Demonstrations, read_manifest
+from hvs_suite.policies.demonstrations import Demonstrations, calibration_of, read_manifest
 from hvs_suite.policies.pretrain import pretrain
 
 
@@ -108,6 +108,19 @@ def test_of_few_demonstrations_only_those_are_seen(dataset, tmp_path):
     demonstrations = Demonstrations(read_manifest(dataset), tmp_path, seed=0, episodes=3)
     seen = np.concatenate([demonstrations.held_out, demonstrations.training])
     assert sorted(seen) == list(range(12))
+
+
+def test_of_few_demonstrations_the_cameras_are_known_from_those_alone(tmp_path):
+    columns = miniature.scene(400)
+    for name, n in (("all", 400), ("few", 240)):
+        first = {key: column[:n] for key, column in columns.items()}
+        miniature.write_dataset(tmp_path / name, first, miniature.episodes(n))
+    few = calibration_of(tmp_path / "few")
+    np.testing.assert_array_equal(calibration_of(tmp_path / "all", episodes=60).rays, few.rays)
+    assert not np.allclose(calibration_of(tmp_path / "all").rays, few.rays)
+    pretrain(tmp_path / "all", tmp_path / "out", steps=1, batch_size=4, episodes=60)
+    rays = weights(tmp_path / "out")["network.rays"]
+    np.testing.assert_allclose(rays, few.rays, rtol=1e-6)
 
 
 @pytest.mark.parametrize("inputs", [("eih", "joints"), ("eth",), ("eih", "eth")])
