@@ -35,6 +35,8 @@ class Finetune:
         noise: Standard deviation of the exploration, as a share of the bound.
         actor_rate: Learning rate of what is added.
         penalty: Weight of the squared share of the bound that is used.
+        lost_share: Share of the episodes that play scenes again that were lost, once there are any:
+            a policy that is good already learns from little else.
         updates: Updates while 40 environment steps are played; four times as many while the
             critics learn alone.
         eval_every: Environment steps between evaluations; one more comes at start and end.
@@ -56,6 +58,7 @@ class Finetune:
     noise: float = 0.2
     actor_rate: float = 1e-4
     penalty: float = 0.1
+    lost_share: float = 0.0
     updates: int = 20
     eval_every: int = 10_000
     eval_episodes: int = 100
@@ -75,6 +78,7 @@ class Finetune:
             noise=self.noise,
             actor_rate=self.actor_rate,
             penalty=self.penalty,
+            lost_share=self.lost_share,
             updates=self.updates,
         )
         registry.find(self.task)

@@ -46,7 +46,8 @@ class Outlook:
             from flange axis to inward normal (3), and the length of either, also on a finer scale.
         """
         network = self._network
-        longest = network.joint_speed * CONTROL_PERIOD_S
+        # A hair more than it can: at the very end of a clamp's range rounding decides on its slope.
+        longest = network.joint_speed * CONTROL_PERIOD_S * (1.0 + 1e-4)
         step = network.to_step(features[:, -N_JOINTS:] + self._bound * action)
         joints, sent = (privileged[:, which] * network.joint_range for which in (JOINTS, SENT))
         motion = geometry.flange_motion(sent + (joints + step - sent).clamp(-longest, longest))

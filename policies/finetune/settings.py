@@ -38,6 +38,7 @@ class Settings:
         eye_frames: Frames a round.
         eye_steps: Optimiser steps a round.
         eye_rate: Learning rate of the eyes.
+        lost_share: Share of the episodes that play scenes again that were lost, once there are any.
         environments: Worker processes that play.
     """
 
@@ -62,6 +63,7 @@ class Settings:
     eye_frames: int = 6_000
     eye_steps: int = 1_000
     eye_rate: float = 5e-4
+    lost_share: float = 0.0
     environments: int = 2
 
     def __post_init__(self) -> None:
@@ -84,6 +86,10 @@ class Settings:
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise OptionError(f"{name} must be 0 or more, not {value}")
+        if not 0.0 <= self.lost_share < 1.0:
+            raise OptionError(
+                f"lost_share must be at least 0 and less than 1, not {self.lost_share}"
+            )
         if not (math.isfinite(self.bound) and self.bound > 0):
             raise OptionError(f"bound must be above 0, not {self.bound}")
         if self.collect_steps % self.environments:

@@ -192,7 +192,7 @@ class MakeStage:
             settings.shaping,
             settings.gamma,
         )
-        return Journal(stage, self.seed, self.part, settings.environments)
+        return Journal(stage, self.seed, self.part, settings.environments, settings.lost_share)
 
 
 def _environments(make: MakeStage) -> Meanwhile:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from hvs_suite.policies.hvs import geometry
-from hvs_suite.policies.hvs.network import Decision, HvsNetwork, memory_size
+from hvs_suite.policies.hvs.network import N_JOINTS, Decision, HvsNetwork, memory_size
 
 # TorchScript looks at what it runs before it settles how.
 _WARM_UP_CALLS = 3
@@ -71,7 +71,7 @@ class CompiledFeatures:
             memory: See `HvsNetwork.forward`.
 
         Returns:
-            ``out``, ``features`` and ``memory`` of the `Decision`.
+            What a residual is added to, (1, 7), and ``features`` and ``memory`` of the `Decision`.
         """
         return self._features(images, state, memory)
 
@@ -131,5 +131,5 @@ def _commands(network: HvsNetwork, decision: Decision, state: Tensor) -> tuple[T
 
 
 def _features(network: HvsNetwork, decision: Decision, state: Tensor) -> tuple[Tensor, Tensor]:
-    """The output, and what it was made of."""
-    return decision.out, decision.features
+    """What a residual is added to, and what it reads, which ends in that."""
+    return decision.features[:, -N_JOINTS:], decision.features

@@ -151,7 +151,8 @@ class Decision:
 
     Attributes:
         out: What the network says, (B, 7), see `HvsNetwork.to_action`.
-        features: What a residual reads, (B, n): the head's inputs, and what the head alone says.
+        features: What a residual reads, (B, n): the head's inputs, and what it is added to, which
+            is what of the head's own output the set point can follow.
         sightings: Camera name to what it saw.
         target: Where the target is taken to be, (B, 3) m in the base frame; None without joints.
         memory: What to remember for the next observation, (B, 4 n + 10) for n cameras, before
@@ -435,7 +436,8 @@ class HvsNetwork(nn.Module):
         features = [s.features() for s in sightings.values()]
         if state is None:
             inputs = torch.cat(features, dim=1)
-            out, known = self._with_residual(inputs, self.head(inputs))
+            out = self.head(inputs)
+            out, known = self._with_residual(inputs, out, out)
             return Decision(out, known, sightings, None, None, None)
         q = state[:, :N_JOINTS]
         if memory is None:
@@ -494,7 +496,7 @@ class HvsNetwork(nn.Module):
             for sighting in sightings.values():
                 has_seen = has_seen | (sighting.visible_logit[:, 0] > -SEEN_LOGIT)
             out = torch.where(has_seen[:, None], out, self._look_out(q, set_point))
-        out, known = self._with_residual(inputs, out)
+        out, known = self._with_residual(inputs, out, self._within_reach(out, q, set_point))
         return Decision(out, known, sightings, target, remembered, motion)
 
     def _ways(self, q: Tensor, goals: list[Tensor]) -> list[tuple[Tensor, ...]]:
@@ -560,12 +562,31 @@ class HvsNetwork(nn.Module):
         believed = sums[:, :1] / (sums[:, 1:] + torch.exp(self.log_height_doubt))
         return depth, believed, sums.detach()
 
-    def _with_residual(self, inputs: Tensor, out: Tensor) -> tuple[Tensor, Tensor]:
-        """The output with what fine-tuning adds to it, and the features that this reads."""
-        known = torch.cat([inputs, out], dim=1)
+    def _with_residual(self, inputs: Tensor, out: Tensor, useful: Tensor) -> tuple[Tensor, Tensor]:
+        """The output with what fine-tuning adds to what of it is of use, and what this reads."""
+        known = torch.cat([inputs, useful], dim=1)
         if self.residual is not None:
-            out = out + self.shape.residual_bound * self.residual(known)
+            out = useful + self.shape.residual_bound * self.residual(known)
         return out, known
+
+    def _within_reach(self, out: Tensor, q: Tensor, set_point: Tensor) -> Tensor:
+        """What of the head's output is of use: the set point moves only as fast as the joints may.
+
+        Who asks for seven times that gets no more, but a residual that is added to it is lost.
+
+        Args:
+            out: (B, 7).
+            q: Measured joint positions, (B, 7) rad.
+            set_point: Where the arm has been sent, (B, 7) rad.
+
+        Returns:
+            The output nearest to it that is within a control step of the set point, (B, 7).
+        """
+        pending, longest = set_point - q, self.joint_speed * CONTROL_PERIOD_S
+        ends = (
+            torch.asinh((pending + way) / self.shape.error_scale) for way in (-longest, longest)
+        )
+        return out.clamp(*ends)
 
     def _place(
         self, motion: geometry.FlangeMotion, sightings: Mapping[str, Sighting], memory: Tensor

@@ -1,7 +1,11 @@
 """The environment that RL learns in, which can be put back into the middle of an episode.
 
-A scene is a function of its index, and physics of scene and actions: the number of the episode and
-the actions since its reset are all there is to keep.
+A scene is a function of its index, and physics of scene and actions: which scene it is and the
+actions since its reset are all there is to keep.
+
+Who is good already loses one scene in thirty, and learns from little else. So scenes that were lost
+may come again, in turn, between those that are new; a plain form of prioritised level replay (Jiang
+and others, 2021: https://arxiv.org/abs/2010.03934).
 """
 
 from collections.abc import Mapping
@@ -35,24 +39,38 @@ class Journal(gymnasium.Wrapper[Any, Any, Any, Any]):
         seed: Of the run; below 2^32.
         part: Which of the run's environments this is.
         parts: How many the run has; they share its scenes between them.
+        lost_share: Share of the episodes, from the first lost one on, that play lost scenes again.
     """
 
     def __init__(
-        self, env: gymnasium.Env[Any, Any], seed: int, part: int = 0, parts: int = 1
+        self,
+        env: gymnasium.Env[Any, Any],
+        seed: int,
+        part: int = 0,
+        parts: int = 1,
+        lost_share: float = 0.0,
     ) -> None:
         super().__init__(env)
         self._first = seed * SCENES_A_SEED + part
         self._parts = parts
+        self._lost_share = lost_share
         self._episode = 0
+        self._again = 0
+        self._lost: list[int] = []
         self._actions: list[npt.NDArray[np.float32]] = []
         self._standing: dict[str, Any] | None = None
 
     def place(self) -> dict[str, Any]:
-        """Where it is, as JSON has it: the episode's number, and the actions since its reset.
+        """Where it is, as JSON has it: what decides on the scene, and the actions since its reset.
 
         Of a `Curriculum` inside, also its standing at that reset.
         """
-        place = {"episode": self._episode, "actions": [a.tolist() for a in self._actions]}
+        place = {
+            "episode": self._episode,
+            "again": self._again,
+            "lost": list(self._lost),
+            "actions": [a.tolist() for a in self._actions],
+        }
         return place if self._standing is None else {**place, "curriculum": self._standing}
 
     def go_to(self, place: Mapping[str, Any]) -> None:
@@ -61,7 +79,8 @@ class Journal(gymnasium.Wrapper[Any, Any, Any, Any]):
         Args:
             place: As `place` gave it.
         """
-        self._episode = int(place["episode"])
+        self._episode, self._again = int(place["episode"]), int(place["again"])
+        self._lost = [int(scene) for scene in place["lost"]]
         self._actions = [np.array(action, np.float32) for action in place["actions"]]
         if "curriculum" in place:
             self.get_wrapper_attr("restore")(place["curriculum"])
@@ -69,14 +88,13 @@ class Journal(gymnasium.Wrapper[Any, Any, Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Goes to where the journal ends: the next scene, or the middle of one just restored.
+        """Goes to where the journal ends: the scene that is due, or its middle if just restored.
 
         Args:
             seed: Not used; the scenes are the run's own.
             options: Not used.
         """
-        scene = {"scenario": self._first + self._parts * self._episode}
-        observation, info = self.env.reset(options=scene)
+        observation, info = self.env.reset(options={"scenario": self._scene()})
         if self.has_wrapper_attr("standing"):
             self._standing = self.get_wrapper_attr("standing")()
         for action in self._actions:
@@ -88,9 +106,30 @@ class Journal(gymnasium.Wrapper[Any, Any, Any, Any]):
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._actions.append(np.array(action, np.float32))
         if terminated or truncated:
-            self._episode += 1
-            self._actions = []
+            self._end(bool(info["is_success"]))
         return observation, reward, terminated, truncated, info
+
+    def _is_again(self) -> bool:
+        """Whether the scene that is due is one that was lost before."""
+        if not self._lost:
+            return False
+        new = self._episode - (self._lost[0] - self._first) // self._parts
+        return self._again * (1.0 - self._lost_share) < self._lost_share * new
+
+    def _scene(self) -> int:
+        if self._is_again():
+            return self._lost[self._again % len(self._lost)]
+        return self._first + self._parts * self._episode
+
+    def _end(self, success: bool) -> None:
+        """Note how the episode ended; from here on the next is due."""
+        if self._is_again():
+            self._again += 1
+        else:
+            if not success:
+                self._lost.append(self._scene())
+            self._episode += 1
+        self._actions = []
 
 
 def make_journal(

@@ -2,7 +2,9 @@
 
 import dataclasses
 import json
+import math
 
+import gymnasium
 import miniature
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from rl_state import state_of
 from safetensors.torch import load_file
 
 import hvs_suite
+from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S, set_point_after
 from hvs_suite.cli.finetune import Finetune
 from hvs_suite.cli.main import run
 from hvs_suite.datasets.expert import Expert
@@ -28,8 +31,10 @@ from hvs_suite.policies.finetune.stage import (
     ResidualStage,
 )
 from hvs_suite.policies.finetune.training import finetune
+from hvs_suite.policies.hvs.network import CONTROL_PERIOD_S, SET_POINT
 from hvs_suite.policies.pretrain import pretrain
 from hvs_suite.policies.rl.evaluation import Evaluation, fallen
+from hvs_suite.policies.rl.journal import Journal
 from hvs_suite.rollout import run_episode
 
 pytestmark = pytest.mark.timeout(600)
@@ -38,13 +43,27 @@ SIDE = 28
 OPTIONS = {"eih_resolution": SIDE, "eth_resolution": SIDE, "time_limit_steps": 5}
 SMALL = Settings(
     batch_size=8, replay_size=24, warm_up_steps=12, collect_steps=6, updates=2, hidden=16,
-    eye_rounds=1, eye_frames=12, eye_steps=2, environments=1,
+    eye_rounds=1, eye_frames=12, eye_steps=2, environments=1, lost_share=0.5,
 )  # fmt: skip
 CALL = {
     "options": OPTIONS, "settings": SMALL, "eval_every": 1000, "eval_episodes": 2,
     "checkpoint_period_s": 0.0,
 }  # fmt: skip
 STEPS = 42
+
+
+class LoseThose(gymnasium.Env):
+    """Episodes of a single step, of which some scenes' are lost."""
+
+    def __init__(self, lost):
+        self.lost, self.played = lost, []
+
+    def reset(self, *, seed=None, options=None):
+        self.played.append(options["scenario"])
+        return 0, {}
+
+    def step(self, action):
+        return 0, 0.0, True, False, {"is_success": self.played[-1] not in self.lost}
 
 
 class Killed(BaseException):
@@ -86,18 +105,44 @@ def played(folder, options=OPTIONS):
         return run_episode(env, CheckpointPolicy(folder, env.variant), 0).actions
 
 
+def sent(folder):
+    """Where those actions send the arm, step by step; one that asks for more gets no more."""
+    set_point, way = np.zeros(7), []
+    for action in played(folder):
+        set_point = set_point_after(set_point, action * JOINT_RANGE_RAD, CONTROL_PERIOD_S)
+        way.append(set_point)
+    return np.array(way)
+
+
 def test_a_residual_adds_nothing_at_first_and_no_more_than_its_bound_ever(base, tmp_path):
     plain = load_base(base)
     network = with_residual(plain, hidden=16, bound=0.6)
     write_folded(base, network, tmp_path / "folded")
-    np.testing.assert_array_equal(played(tmp_path / "folded"), played(base))
+    np.testing.assert_allclose(sent(tmp_path / "folded"), sent(base), atol=1e-6)
     with torch.no_grad():
         network.residual[-2].bias.fill_(100.0)
     images = {name: torch.rand(3, 3, SIDE, SIDE) for name in ("eih", "eth")}
     state = torch.rand(3, 14)
     with torch.no_grad():
-        added = network(images, state).out - plain(images, state).out
+        added = network(images, state).out - plain(images, state).features[:, -7:]
     torch.testing.assert_close(added, torch.full_like(added, 0.6))
+
+
+def test_a_residual_holds_an_arm_back_that_the_base_wants_to_go_faster_than_joints_can(base):
+    network = with_residual(load_base(base), hidden=16, bound=0.6)
+    images = {name: torch.rand(1, 3, SIDE, SIDE) for name in ("eih", "eth")}
+    state = torch.zeros(1, 14)
+    ways = {}
+    with torch.no_grad():
+        network.head[-1].bias.fill_(30.0)
+        for shares in (0.0, -100.0):
+            network.residual[-2].bias.fill_(shares)
+            decision = network(images, state)
+            action = network.to_action(decision.out, state)
+            ways[shares] = network.commanded(decision.memory, action)[0, SET_POINT]
+    longest = torch.as_tensor(JOINT_SPEED_RAD_S, dtype=torch.float32) * CONTROL_PERIOD_S
+    torch.testing.assert_close(ways[0.0], longest)
+    torch.testing.assert_close(ways[-100.0], longest * math.exp(-0.6), rtol=0.05, atol=0.0)
 
 
 def test_the_action_zero_plays_the_base(base):
@@ -261,6 +306,20 @@ def test_two_environments_share_the_scenes(base, tmp_path):
     assert outcome.env_steps == 24
     _, header = state_of(tmp_path / "two")
     assert len(header["places"]) == 2
+
+
+def test_scenes_that_were_lost_come_again_in_turn_between_new_ones():
+    journal = Journal(LoseThose({2, 3}), seed=0, lost_share=0.5)
+    for _ in range(9):
+        journal.reset()
+        journal.step(np.zeros(7, np.float32))
+    played = journal.unwrapped.played
+    assert played == [0, 1, 2, 2, 3, 3, 4, 2, 5]
+    restored = Journal(LoseThose({2, 3}), seed=0, lost_share=0.5)
+    restored.go_to(journal.place())
+    for each in (journal, restored):
+        each.reset()
+    assert restored.unwrapped.played == journal.unwrapped.played[9:]
 
 
 def test_lerobot_plays_what_comes_of_it(whole):
