@@ -6,11 +6,15 @@ imitation, where the expert labels every one of those steps (DAgger); and RL fro
 no base. All lie in one folder; what is finished there is not done again.
 """
 
+import contextlib
 import dataclasses
 import json
 import math
+import multiprocessing
+import queue
 import shutil
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +23,11 @@ import pydantic
 from hvs_suite.errors import OptionError
 from hvs_suite.eval.comparison import Tally
 from hvs_suite.eval.result_file import Result
-from hvs_suite.eval.study_training import SPLIT, Report, earlier_result, judge
+from hvs_suite.eval.study_training import Report, earlier_result, judge
 from hvs_suite.policies.demonstrations import read_manifest
-from hvs_suite.statistics import mean_rate_interval
+from hvs_suite.rollout import worker_conditions
 
 FINETUNED, IMITATED, SCRATCH = "RL fine-tuning", "more imitation", "RL from scratch"
-COLOURS = {FINETUNED: "#e9620a", IMITATED: "#2b6cb0", SCRATCH: "#7a3fa0"}
 EVAL_EPISODES = 100
 """Scenes of an evaluation amid RL, at most."""
 GIGABYTES = ("cache", "dagger", "replay", "eyes")
@@ -120,7 +123,7 @@ class Budget:
         eye_steps: Optimiser steps of each of them.
         seeds: Runs of everything.
         episodes: Scenes of split ``dev`` that ends are judged on.
-        workers: Processes that play.
+        processes: Processes that make runs side by side, each on one core.
     """
 
     env_steps: int
@@ -131,7 +134,7 @@ class Budget:
     eye_steps: int
     seeds: int
     episodes: int
-    workers: int
+    processes: int
 
     def __post_init__(self) -> None:
         """Refuse what makes no sense.
@@ -173,6 +176,7 @@ def run_study(
                 f"demonstrations must be 2 to the dataset's {manifest.n_episodes}, not {count}"
             )
     maker = _Maker(data, manifest.task, out, budget, report)
+    _make_side_by_side(maker, counts, report)
     curves: list[Curve] = []
     ends: dict[tuple[int, str], list[Result]] = {}
     for seed in range(budget.seeds):
@@ -200,6 +204,55 @@ def run_study(
         curves=curves,
         comparisons=[_versus(count, way, other, ends) for count in counts for way, other in pairs],
     )
+
+
+_reports: "multiprocessing.Queue[tuple[str, float, str]]"
+"""Of a process that makes runs: where its reports go."""
+REPORTS_EVERY_S = 0.2
+
+
+def _make_side_by_side(maker: "_Maker", counts: Sequence[int], report: Report) -> None:
+    """Make all runs, those from the same base one after the other, in several processes."""
+    context = multiprocessing.get_context("spawn")
+    reports: multiprocessing.Queue[tuple[str, float, str]] = context.Queue()
+    seeds = range(maker.budget.seeds)
+    families = [(count, seed) for count in counts for seed in seeds]
+    families += [(0, seed) for seed in seeds]
+    silent = dataclasses.replace(maker, report=_report)
+    with ProcessPoolExecutor(maker.budget.processes, context, _report_to, (reports,)) as pool:
+        with worker_conditions():
+            runs = [pool.submit(_make_family, silent, *family) for family in families]
+        try:
+            while not all(run.done() for run in runs):
+                with contextlib.suppress(queue.Empty):
+                    report(*reports.get(timeout=REPORTS_EVERY_S))
+                for run in runs:
+                    if run.done():
+                        run.result()
+        except BaseException:
+            # A run goes on where it is when the same command is given again.
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
+
+
+def _report_to(reports: "multiprocessing.Queue[tuple[str, float, str]]") -> None:
+    global _reports
+    _reports = reports
+
+
+def _report(stage: str, share: float, words: str) -> None:
+    _reports.put((stage, share, words))
+
+
+def _make_family(maker: "_Maker", count: int, seed: int) -> None:
+    """Make a base and what comes of it; without demonstrations, the run that has none."""
+    if count:
+        for make in (maker.base, maker.finetuned, maker.imitated):
+            make(count, seed)
+    else:
+        maker.scratch(seed)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -239,7 +292,7 @@ class _Maker:
             eye_rounds=2 if budget.eye_frames >= 2 else 0,
             eye_frames=max(1, budget.eye_frames // 2),
             eye_steps=budget.eye_steps,
-            environments=budget.workers,
+            environments=1,
         )
 
         def train(policy: Path, note: Note) -> None:
@@ -274,7 +327,7 @@ class _Maker:
                 seed=seed,
                 dagger_rounds=budget.imitation_rounds,
                 dagger_frames=frames,
-                workers=budget.workers,
+                workers=1,
                 on_progress=note,
             )
 
@@ -332,7 +385,7 @@ class _Maker:
                 run,
                 self.report,
                 scenarios=budget.episodes,
-                workers=budget.workers,
+                workers=1,
             )
             for kept in GIGABYTES:
                 shutil.rmtree(training / kept, ignore_errors=True)
@@ -385,87 +438,3 @@ def _versus(count: int, way: str, other: str, ends: dict[tuple[int, str], list[R
         n_only_other=tally.n_only_b,
         p=tally.p,
     )
-
-
-def _pooled(points: Sequence[Point]) -> tuple[float, float, float]:
-    """Mean success of several seeds and its 95 % interval (%)."""
-    counts = [(point.n_success, point.n) for point in points]
-    low, high = mean_rate_interval(counts)
-    return 100.0 * sum(k / n for k, n in counts) / len(counts), low, high
-
-
-def _curves(study: Study, way: str, count: int) -> list[Curve]:
-    wanted = 0 if way == SCRATCH else count
-    return [c for c in study.curves if (c.way, c.demonstrations) == (way, wanted)]
-
-
-def markdown(study: Study) -> str:
-    """The study's tables."""
-    counts = sorted({curve.demonstrations for curve in study.curves} - {0})
-    lines = [
-        f"`{study.task}`, split `{SPLIT}`, mean of {study.seeds} seeds with its 95 % interval: "
-        f"bases of {study.base_steps:,} optimiser steps, then {study.env_steps:,} environment "
-        "steps.",
-        "",
-        f"| demonstrations | base | {FINETUNED} | of the gap closed | minutes | {IMITATED} "
-        f"| minutes | {SCRATCH} |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for count in counts:
-        tuned, imitated, scratch = (_curves(study, way, count) for way in COLOURS)
-        base = _pooled([curve.points[0] for curve in tuned])
-        ends = [_pooled([c.points[-1] for c in way]) for way in (tuned, imitated, scratch)]
-        closed = (ends[0][0] - base[0]) / max(1e-9, 100.0 - base[0])
-        minutes = [sum(c.minutes for c in way) / len(way) for way in (tuned, imitated)]
-        cells = [f"{mean:.1f} % ({low:.1f} to {high:.1f})" for mean, low, high in (base, *ends)]
-        lines.append(
-            f"| {count} | {cells[0]} | {cells[1]} | {100 * closed:.0f} % | {minutes[0]:.0f} "
-            f"| {cells[2]} | {minutes[1]:.0f} | {cells[3]} |"
-        )
-    lines += [
-        "",
-        "| demonstrations | against each other | only the first, only the second | p |",
-        "|---|---|---|---|",
-    ]
-    lines += [
-        f"| {row.demonstrations} | {row.way}, {row.other} | {row.n_only_way}, {row.n_only_other} "
-        f"| {row.p:.2g} |"
-        for row in study.comparisons
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def draw(study: Study) -> Any:
-    """Success against environment steps, a panel for each number of demonstrations.
-
-    Returns:
-        A ``matplotlib.figure.Figure``.
-    """
-    from matplotlib.figure import Figure
-
-    counts = sorted({curve.demonstrations for curve in study.curves} - {0})
-    size = (3.4 * len(counts) + 0.6, 3.6)
-    figure = Figure(figsize=size, dpi=130, facecolor="white", layout="constrained")
-    for axes, count in zip(
-        figure.subplots(1, len(counts), sharey=True, squeeze=False)[0], counts, strict=True
-    ):
-        for way, colour in COLOURS.items():
-            curves = _curves(study, way, count)
-            # A run that was ended early has fewer points than its sisters.
-            steps = sorted(set.intersection(*({p.env_steps for p in c.points} for c in curves)))
-            pooled = [
-                _pooled([next(p for p in c.points if p.env_steps == at) for c in curves])
-                for at in steps
-            ]
-            means, lows, highs = zip(*pooled, strict=True)
-            thousands = [at / 1000.0 for at in steps]
-            axes.plot(thousands, means, color=colour, marker="o", markersize=3, label=way)
-            axes.fill_between(thousands, lows, highs, color=colour, alpha=0.15, linewidth=0)
-        axes.set_title(f"{count} demonstrations", fontsize=9, loc="left")
-        axes.set(xlabel="environment steps (thousands)", ylim=(0.0, 102.0))
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(axis="y", color="#e4e4e2", linewidth=0.6)
-    figure.axes[0].set_ylabel("solved (%)")
-    figure.axes[0].legend(fontsize=7, frameon=False, loc="lower right")
-    figure.suptitle(f"{study.task}: from a few demonstrations", fontsize=10, x=0.01, ha="left")
-    return figure

@@ -150,25 +150,25 @@ class FewDemonstrations:
         eye_steps: Optimiser steps of each of them.
         seeds: Runs of everything.
         episodes: Scenes of split dev that bases and ends are judged on.
-        workers: Processes that play.
+        processes: Processes that make runs side by side, each on one core.
     """
 
     data: Path
     out: Path
     demonstrations: tuple[int, ...] = ()
-    env_steps: int = 40_000
-    base_steps: int = 1500
-    imitation_steps: int = 4500
-    imitation_rounds: int = 5
-    eye_frames: int = 12_000
-    eye_steps: int = 1_000
+    env_steps: int = 16_000
+    base_steps: int = 1_000
+    imitation_steps: int = 2_500
+    imitation_rounds: int = 4
+    eye_frames: int = 6_000
+    eye_steps: int = 500
     seeds: int = 3
     episodes: int = 200
-    workers: int = 2
+    processes: int = 2
 
     def run(self) -> None:
         """Train and judge, showing how it goes; write and print what was found."""
-        from hvs_suite.eval import few_demonstrations
+        from hvs_suite.eval import few_demonstrations, few_demonstrations_report
         from hvs_suite.files import check_writable
 
         check_writable(self.out / "study.json")
@@ -181,13 +181,14 @@ class FewDemonstrations:
             eye_steps=self.eye_steps,
             seeds=self.seeds,
             episodes=self.episodes,
-            workers=self.workers,
+            processes=self.processes,
         )
         counts = self.demonstrations or (25, 50, 100, 200)
         with console.meter() as update:
             study = few_demonstrations.run_study(self.data, self.out, counts, budget, update)
-        text = few_demonstrations.markdown(study)
-        _write(self.out, study.model_dump_json(indent=2), text, few_demonstrations.draw(study))
+        text = few_demonstrations_report.markdown(study)
+        figure = few_demonstrations_report.draw(study)
+        _write(self.out, study.model_dump_json(indent=2), text, figure)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

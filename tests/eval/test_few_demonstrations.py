@@ -6,13 +6,13 @@ from pathlib import Path
 import pytest
 
 from hvs_suite.errors import OptionError
-from hvs_suite.eval import few_demonstrations
+from hvs_suite.eval import few_demonstrations_report
 from hvs_suite.eval.few_demonstrations import FINETUNED, IMITATED, SCRATCH, Budget, run_study
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "align-thesis"
 BUDGET = Budget(
     env_steps=120, base_steps=2, imitation_steps=3, imitation_rounds=2, eye_frames=40, eye_steps=2,
-    seeds=1, episodes=2, workers=1,
+    seeds=1, episodes=2, processes=2,
 )  # fmt: skip
 pytestmark = pytest.mark.timeout(600)
 
@@ -34,14 +34,14 @@ def test_every_way_has_the_same_steps_and_is_not_made_twice(tmp_path):
     again = []
     assert run_study(SAMPLE, tmp_path, [3], BUDGET, lambda *w: again.append(w[0])) == study
     assert not again
-    text = few_demonstrations.markdown(study)
+    text = few_demonstrations_report.markdown(study)
     assert "| 3 |" in text
-    figure = few_demonstrations.draw(study)
+    figure = few_demonstrations_report.draw(study)
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["3 demonstrations"]
     assert len(figure.axes[0].lines) == 3
 
 
-@pytest.mark.parametrize("change", [{"seeds": 0}, {"env_steps": 40}, {"workers": 0}])
+@pytest.mark.parametrize("change", [{"seeds": 0}, {"env_steps": 40}, {"processes": 0}])
 def test_a_budget_that_makes_no_sense_is_refused(change):
     with pytest.raises(OptionError):
         dataclasses.replace(BUDGET, **change)

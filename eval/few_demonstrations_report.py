@@ -1,0 +1,94 @@
+"""Tables and picture of the study of few demonstrations."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from hvs_suite.eval.few_demonstrations import FINETUNED, IMITATED, SCRATCH, Curve, Point, Study
+from hvs_suite.eval.study_training import SPLIT
+from hvs_suite.statistics import mean_rate_interval
+
+COLOURS = {FINETUNED: "#e9620a", IMITATED: "#2b6cb0", SCRATCH: "#7a3fa0"}
+
+
+def _pooled(points: Sequence[Point]) -> tuple[float, float, float]:
+    """Mean success of several seeds and its 95 % interval (%)."""
+    counts = [(point.n_success, point.n) for point in points]
+    low, high = mean_rate_interval(counts)
+    return 100.0 * sum(k / n for k, n in counts) / len(counts), low, high
+
+
+def _curves(study: Study, way: str, count: int) -> list[Curve]:
+    wanted = 0 if way == SCRATCH else count
+    return [c for c in study.curves if (c.way, c.demonstrations) == (way, wanted)]
+
+
+def markdown(study: Study) -> str:
+    """The study's tables."""
+    counts = sorted({curve.demonstrations for curve in study.curves} - {0})
+    lines = [
+        f"`{study.task}`, split `{SPLIT}`, mean of {study.seeds} seeds with its 95 % interval: "
+        f"bases of {study.base_steps:,} optimiser steps, then {study.env_steps:,} environment "
+        "steps.",
+        "",
+        f"| demonstrations | base | {FINETUNED} | of the gap closed | minutes | {IMITATED} "
+        f"| minutes | {SCRATCH} |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for count in counts:
+        tuned, imitated, scratch = (_curves(study, way, count) for way in COLOURS)
+        base = _pooled([curve.points[0] for curve in tuned])
+        ends = [_pooled([c.points[-1] for c in way]) for way in (tuned, imitated, scratch)]
+        closed = (ends[0][0] - base[0]) / max(1e-9, 100.0 - base[0])
+        minutes = [sum(c.minutes for c in way) / len(way) for way in (tuned, imitated)]
+        cells = [f"{mean:.1f} % ({low:.1f} to {high:.1f})" for mean, low, high in (base, *ends)]
+        lines.append(
+            f"| {count} | {cells[0]} | {cells[1]} | {100 * closed:.0f} % | {minutes[0]:.0f} "
+            f"| {cells[2]} | {minutes[1]:.0f} | {cells[3]} |"
+        )
+    lines += [
+        "",
+        "| demonstrations | against each other | only the first, only the second | p |",
+        "|---|---|---|---|",
+    ]
+    lines += [
+        f"| {row.demonstrations} | {row.way}, {row.other} | {row.n_only_way}, {row.n_only_other} "
+        f"| {row.p:.2g} |"
+        for row in study.comparisons
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def draw(study: Study) -> Any:
+    """Success against environment steps, a panel for each number of demonstrations.
+
+    Returns:
+        A ``matplotlib.figure.Figure``.
+    """
+    from matplotlib.figure import Figure
+
+    counts = sorted({curve.demonstrations for curve in study.curves} - {0})
+    size = (3.4 * len(counts) + 0.6, 3.6)
+    figure = Figure(figsize=size, dpi=130, facecolor="white", layout="constrained")
+    for axes, count in zip(
+        figure.subplots(1, len(counts), sharey=True, squeeze=False)[0], counts, strict=True
+    ):
+        for way, colour in COLOURS.items():
+            curves = _curves(study, way, count)
+            # A run that was ended early has fewer points than its sisters.
+            steps = sorted(set.intersection(*({p.env_steps for p in c.points} for c in curves)))
+            pooled = [
+                _pooled([next(p for p in c.points if p.env_steps == at) for c in curves])
+                for at in steps
+            ]
+            means, lows, highs = zip(*pooled, strict=True)
+            thousands = [at / 1000.0 for at in steps]
+            axes.plot(thousands, means, color=colour, marker="o", markersize=3, label=way)
+            axes.fill_between(thousands, lows, highs, color=colour, alpha=0.15, linewidth=0)
+        axes.set_title(f"{count} demonstrations", fontsize=9, loc="left")
+        axes.set(xlabel="environment steps (thousands)", ylim=(0.0, 102.0))
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="y", color="#e4e4e2", linewidth=0.6)
+    figure.axes[0].set_ylabel("solved (%)")
+    figure.axes[0].legend(fontsize=7, frameon=False, loc="lower right")
+    figure.suptitle(f"{study.task}: from a few demonstrations", fontsize=10, x=0.01, ha="left")
+    return figure
