@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import nn
 
+from hvs_suite.datasets.features import ACTION_EXECUTED
 from hvs_suite.errors import OptionError, PolicyError
 from hvs_suite.policies.checkpoint import load_network, read_config
 from hvs_suite.policies.demonstrations import Manifest, calibration_of
@@ -90,6 +91,16 @@ def tightest_scale(manifest: Manifest) -> float:
     return 5e-3 * task.tightest_tolerance_mm
 
 
+def trails_its_set_point(manifest: Manifest) -> bool:
+    """Whether the arm goes on for steps after it was told to stop, and the dataset says where to.
+
+    Args:
+        manifest: Of the dataset.
+    """
+    task = with_options(find(manifest.task), manifest.options)
+    return task.latency_steps > 0 and ACTION_EXECUTED in manifest.features
+
+
 def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":
     """A fresh policy for a dataset's inputs, its cameras calibrated from what it is to learn from.
 
@@ -117,6 +128,7 @@ def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":
         optimizer_lr=settings.learning_rate,
         keypoint_weight=settings.keypoint_weight,
         error_scale=settings.error_scale,
+        from_set_point=STATE in inputs and trails_its_set_point(manifest),
     )
     # torch initialises weights from its global generator; leave that as it was found.
     with torch.random.fork_rng(devices=[]):

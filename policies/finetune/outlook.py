@@ -50,7 +50,8 @@ class Outlook:
         longest = network.joint_speed * CONTROL_PERIOD_S * (1.0 + 1e-4)
         step = network.to_step(features[:, -N_JOINTS:] + self._bound * action)
         joints, sent = (privileged[:, which] * network.joint_range for which in (JOINTS, SENT))
-        motion = geometry.flange_motion(sent + (joints + step - sent).clamp(-longest, longest))
+        origin = sent if network.shape.from_set_point else joints
+        motion = geometry.flange_motion(sent + (origin + step - sent).clamp(-longest, longest))
         way = privileged[:, GOAL] - motion.position
         turn = torch.linalg.cross(motion.rotation[:, :, 2], -privileged[:, NORMAL], dim=1)
         # Where the length is 0 the norm has no slope.

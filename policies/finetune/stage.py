@@ -132,9 +132,11 @@ class ResidualStage(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Play one control step with the base's action and what is added to it."""
         assert self._out is not None
         assert self._memory is not None
+        assert self._state is not None
         added = self._bound * torch.from_numpy(np.clip(action, -1.0, 1.0).astype(np.float32))
         with torch.inference_mode():
-            command = self._network.to_action(self._out + added, self._state)
+            origin = self._network.origin(self._state, self._memory)
+            command = self._network.to_action(self._out + added, origin)
             self._memory = self._network.commanded(self._memory, command)
         observation, reward, terminated, truncated, info = self.env.step(command[0].numpy())
         before, self._potential = self._potential, self._phi(info)

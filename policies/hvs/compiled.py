@@ -126,7 +126,8 @@ class _Decides(nn.Module):
 
 def _commands(network: HvsNetwork, decision: Decision, state: Tensor) -> tuple[Tensor, Tensor]:
     """Where to send the joints, and how high the flange is there."""
-    target = network.to_target(decision.out, state)
+    assert decision.memory is not None
+    target = network.to_target(decision.out, network.origin(state, decision.memory))
     return target, geometry.flange_motion(target).position[:, 2:]
 
 

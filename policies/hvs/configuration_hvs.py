@@ -36,6 +36,9 @@ class HvsConfig(PreTrainedConfig):
             (rad) and of a place (m). Some five times the tolerance that is aimed at.
         residual_hidden: Width of the residual that ``hvs finetune`` learns; 0 for none.
         residual_bound: The most that it adds to the output of the head.
+        from_set_point: Joint steps are counted from where the arm has been sent, and not from where
+            it stands; for a policy that learned with that in its memory, of an arm with latency
+            (docs/experiments/from-set-point.md).
         keypoint_weight: Weight of the losses against the projected target and its place in space,
             where the dataset has ``privileged.*`` columns; 0 trains on actions alone.
         optimizer_lr: Peak learning rate of stock ``lerobot-train``.
@@ -54,6 +57,7 @@ class HvsConfig(PreTrainedConfig):
     error_scale: float = ERROR_SCALE
     residual_hidden: int = 0
     residual_bound: float = RESIDUAL_BOUND
+    from_set_point: bool = False
     keypoint_weight: float = 1.0
     optimizer_lr: float = 2e-3
     optimizer_weight_decay: float = 1e-4
@@ -116,6 +120,7 @@ class HvsConfig(PreTrainedConfig):
             self.error_scale,
             self.residual_hidden,
             self.residual_bound,
+            self.from_set_point,
         )
 
     def get_optimizer_preset(self) -> AdamWConfig:

@@ -162,7 +162,7 @@ class HvsPolicy(PreTrainedPolicy):
         self, decision: Decision, batch: dict[str, Tensor], state: Tensor | None
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of the expert's step, joint by joint and at the flange, and its parts."""
-        label = self.network.encode_label(batch[ACTION], state)
+        label = self.network.encode_label(batch[ACTION], self._origin(decision, state))
         loss = action_loss(decision.out, label)
         parts = {"action_loss": loss.detach()}
         if (
@@ -183,6 +183,11 @@ class HvsPolicy(PreTrainedPolicy):
             loss = loss + 0.3 * part
         return loss, parts
 
+    def _origin(self, decision: Decision, state: Tensor | None) -> Tensor | None:
+        if state is None or decision.memory is None:
+            return None
+        return self.network.origin(state, decision.memory)
+
     def _truths(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Where the target is in each camera's images, as far as the batch tells."""
         keys = {camera: TARGET_PREFIX + camera for camera in self.network.shape.cameras}
@@ -196,7 +201,7 @@ class HvsPolicy(PreTrainedPolicy):
         if self._memory is not None and len(self._memory) != len(next(iter(images.values()))):
             self._memory = None  # Other environments than before.
         decision = self.network(images, state, self._memory)
-        action = self.network.to_action(decision.out, state)
+        action = self.network.to_action(decision.out, self._origin(decision, state))
         if decision.memory is not None:
             self._memory = self.network.commanded(decision.memory, action)
         return action[:, None]

@@ -81,6 +81,7 @@ class Shape:
         error_scale: See `ERROR_SCALE`; decides what the weights mean.
         residual_hidden: Width of the residual that fine-tuning learns; 0 for none.
         residual_bound: The most that it adds to the head's output.
+        from_set_point: Steps are counted from the set point, and not from the measured joints.
     """
 
     cameras: Mapping[str, tuple[int, int]]
@@ -90,6 +91,7 @@ class Shape:
     error_scale: float = ERROR_SCALE
     residual_hidden: int = 0
     residual_bound: float = RESIDUAL_BOUND
+    from_set_point: bool = False
 
 
 def shape_from_config(config: Mapping[str, Any]) -> Shape:
@@ -119,6 +121,7 @@ def shape_from_config(config: Mapping[str, Any]) -> Shape:
         float(config["error_scale"]),
         int(config.get("residual_hidden", 0)),
         float(config.get("residual_bound", RESIDUAL_BOUND)),
+        bool(config.get("from_set_point", False)),
     )
 
 
@@ -351,8 +354,9 @@ class HvsNetwork(nn.Module):
         self.memory_trust = nn.Parameter(torch.zeros(n_cameras))
         self.step_gain = nn.Parameter(torch.full((N_JOINTS,), 0.5))
         self.stride_gain = nn.Parameter(torch.full((N_JOINTS,), 0.5))
-        self.onward_step_gain = nn.Parameter(torch.zeros(N_JOINTS))
-        self.onward_stride_gain = nn.Parameter(torch.zeros(N_JOINTS))
+        if not shape.from_set_point:
+            self.onward_step_gain = nn.Parameter(torch.zeros(N_JOINTS))
+            self.onward_stride_gain = nn.Parameter(torch.zeros(N_JOINTS))
         # How much higher to aim until the eye in the hand has seen the target.
         self.above_gain = nn.Parameter(torch.zeros(1))
         # How many looks from the goal it takes to believe half of the height that they show.
@@ -465,14 +469,17 @@ class HvsNetwork(nn.Module):
         for turns, time_s, within, each in ways:
             features += [torch.asinh(turns / scale), time_s, within]
             features.append(torch.asinh(each / scale)[:, :-1])
-        strides = [torch.asinh(each / scale) for *_, each in ways]
         # From where the arm is sent: it trails its set point, and may not even have begun to move.
         pending = set_point - q
         sent = geometry.flange_motion(set_point)
-        onward_step = pending + geometry.joint_step(sent, goals[0] - sent.position)
+        begun = torch.zeros_like(q) if self.shape.from_set_point else pending
+        onward_step = begun + geometry.joint_step(sent, goals[0] - sent.position)
         onward_step = torch.asinh(onward_step / scale)
-        onward = [torch.asinh((pending + w[-1]) / scale) for w in self._ways(set_point, goals)]
+        onward = [torch.asinh((begun + w[-1]) / scale) for w in self._ways(set_point, goals)]
         later = [torch.asinh(pending / scale), onward_step, *onward]
+        strides = onward
+        if not self.shape.from_set_point:
+            strides = [torch.asinh(each / scale) for *_, each in ways]
         stride, onward_stride = strides[0], onward[0]
         if "eih" in sightings:
             unseen = 1.0 - remembered[:, SLOT_SIZE - 1 : SLOT_SIZE]
@@ -487,16 +494,22 @@ class HvsNetwork(nn.Module):
         in_flange = torch.asinh(offsets @ motion.rotation / scale)
         features.append(torch.cat([offsets, in_flange, estimates[:, :, 3:]], dim=2).flatten(1))
         inputs = torch.cat([*features, *later], dim=1)
+        if self.shape.from_set_point:
+            step = onward_step
         out = self.head(inputs) + self.step_gain * step + self.stride_gain * stride
-        out = out + self.onward_step_gain * onward_step + self.onward_stride_gain * onward_stride
+        if not self.shape.from_set_point:
+            onward_out = self.onward_step_gain * onward_step
+            out = out + onward_out + self.onward_stride_gain * onward_stride
         if not self.training:
             # As long as all cameras are sure that the target is hidden, and none has seen it, the
             # head can know no way there. What it learns in training must not wait for eyes.
             has_seen = slots[:, SLOT_SIZE - 1 :: SLOT_SIZE].amax(dim=1) > 0
             for sighting in sightings.values():
                 has_seen = has_seen | (sighting.visible_logit[:, 0] > -SEEN_LOGIT)
-            out = torch.where(has_seen[:, None], out, self._look_out(q, set_point))
-        out, known = self._with_residual(inputs, out, self._within_reach(out, q, set_point))
+            there = self._look_out(set_point, self.origin(state, remembered))
+            out = torch.where(has_seen[:, None], out, there)
+        useful = self._within_reach(out, set_point - self.origin(state, remembered))
+        out, known = self._with_residual(inputs, out, useful)
         return Decision(out, known, sightings, target, remembered, motion)
 
     def _ways(self, q: Tensor, goals: list[Tensor]) -> list[tuple[Tensor, ...]]:
@@ -517,20 +530,32 @@ class HvsNetwork(nn.Module):
         whole = (turns, time_s, within, F.pad(step, (0, 1)))
         return list(zip(*(each.chunk(n) for each in whole), strict=True))
 
-    def _look_out(self, q: Tensor, set_point: Tensor) -> Tensor:
+    def origin(self, state: Tensor, memory: Tensor) -> Tensor:
+        """From where joint steps are counted.
+
+        Args:
+            state: As in `forward`.
+            memory: As a `Decision` has it.
+
+        Returns:
+            (B, 7) rad.
+        """
+        return memory[:, SET_POINT] if self.shape.from_set_point else state[:, :N_JOINTS]
+
+    def _look_out(self, set_point: Tensor, origin: Tensor) -> Tensor:
         """The step to where a demonstrator looks for the target, each joint as fast as it can.
 
         Args:
-            q: Measured joint positions, (B, 7) rad.
             set_point: Where the arm has been sent, (B, 7) rad.
+            origin: From where the step is counted, (B, 7) rad.
 
         Returns:
             As the head says it, (B, 7).
         """
         bound = (CONTROL_PERIOD_S + LEAD_S) * self.joint_speed
-        turns = torch.as_tensor(LOOK_OUT_RAD).to(q) - set_point
+        turns = torch.as_tensor(LOOK_OUT_RAD).to(set_point) - set_point
         turns[:, -1] = 0.0
-        step = set_point + turns.clamp(-bound, bound) - q
+        step = set_point + turns.clamp(-bound, bound) - origin
         return torch.asinh(step / self.shape.error_scale)
 
     def _height(
@@ -569,20 +594,19 @@ class HvsNetwork(nn.Module):
             out = useful + self.shape.residual_bound * self.residual(known)
         return out, known
 
-    def _within_reach(self, out: Tensor, q: Tensor, set_point: Tensor) -> Tensor:
+    def _within_reach(self, out: Tensor, pending: Tensor) -> Tensor:
         """What of the head's output is of use: the set point moves only as fast as the joints may.
 
         Who asks for seven times that gets no more, but a residual that is added to it is lost.
 
         Args:
             out: (B, 7).
-            q: Measured joint positions, (B, 7) rad.
-            set_point: Where the arm has been sent, (B, 7) rad.
+            pending: The set point, from where steps are counted, (B, 7) rad.
 
         Returns:
             The output nearest to it that is within a control step of the set point, (B, 7).
         """
-        pending, longest = set_point - q, self.joint_speed * CONTROL_PERIOD_S
+        longest = self.joint_speed * CONTROL_PERIOD_S
         ends = (
             torch.asinh((pending + way) / self.shape.error_scale) for way in (-longest, longest)
         )
@@ -629,21 +653,21 @@ class HvsNetwork(nn.Module):
         estimates = torch.cat([torch.stack([*places, best], dim=1), weights[:, :, None]], dim=2)
         return best, estimates, torch.cat(held, dim=1).detach()
 
-    def to_action(self, out: Tensor, state: Tensor | None) -> Tensor:
+    def to_action(self, out: Tensor, origin: Tensor | None) -> Tensor:
         """Decode the head's output, and keep the flange from going below where goals lie.
 
         Who comes down fast, one joint against another, is easily some centimetres too low.
 
         Args:
             out: (B, 7).
-            state: As in `forward`.
+            origin: See `origin`; None for a policy without joints.
 
         Returns:
             Joint position targets in units of the joint range, (B, 7) in [-1, 1].
         """
-        if state is None:
+        if origin is None:
             return out.clamp(-1.0, 1.0)
-        target = self.to_target(out, state)
+        target = self.to_target(out, origin)
         return self.within_bounds(target, geometry.flange_motion(target).position[:, 2:])
 
     def commanded(self, memory: Tensor, action: Tensor) -> Tensor:
@@ -664,14 +688,14 @@ class HvsNetwork(nn.Module):
         memory[:, SET_POINT] = set_point + way.clamp(-longest, longest)
         return memory
 
-    def to_target(self, out: Tensor, state: Tensor) -> Tensor:
+    def to_target(self, out: Tensor, origin: Tensor) -> Tensor:
         """Joint angles that the head's output stands for, (B, 7) rad, bounds not looked at.
 
         Args:
             out: (B, 7).
-            state: As in `forward`.
+            origin: See `origin`.
         """
-        return state[:, :N_JOINTS] + self.to_step(out)
+        return origin + self.to_step(out)
 
     def within_bounds(self, target: Tensor, height: Tensor) -> Tensor:
         """The action that comes nearest to joint angles and keeps the bounds.
@@ -694,19 +718,19 @@ class HvsNetwork(nn.Module):
         bound = math.asinh(1.0 / self.shape.error_scale)
         return self.shape.error_scale * torch.sinh(out.clamp(-bound, bound))
 
-    def encode_label(self, action: Tensor, state: Tensor | None) -> Tensor:
+    def encode_label(self, action: Tensor, origin: Tensor | None) -> Tensor:
         """Inverse of `to_action` without the clipping: what the head should have said.
 
         Args:
             action: The expert's joint position targets in units of the joint range, (B, 7).
-            state: As in `forward`.
+            origin: See `origin`; None for a policy without joints.
 
         Returns:
             (B, 7).
         """
-        if state is None:
+        if origin is None:
             return action
-        step = action * self.joint_range - state[:, :N_JOINTS]
+        step = action * self.joint_range - origin
         return torch.asinh(step / self.shape.error_scale)
 
 

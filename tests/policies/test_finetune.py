@@ -138,7 +138,7 @@ def test_a_residual_holds_an_arm_back_that_the_base_wants_to_go_faster_than_join
         for shares in (0.0, -100.0):
             network.residual[-2].bias.fill_(shares)
             decision = network(images, state)
-            action = network.to_action(decision.out, state)
+            action = network.to_action(decision.out, network.origin(state, decision.memory))
             ways[shares] = network.commanded(decision.memory, action)[0, SET_POINT]
     longest = torch.as_tensor(JOINT_SPEED_RAD_S, dtype=torch.float32) * CONTROL_PERIOD_S
     torch.testing.assert_close(ways[0.0], longest)

@@ -24,9 +24,11 @@ from hvs_suite.policies.hvs.network import (
 CAMERAS = {"eih": (3, 28), "eth": (3, 28)}
 
 
-def network(cameras=CAMERAS, state_dim=14, seed=0):
+def network(cameras=CAMERAS, state_dim=14, seed=0, from_set_point=False):
     torch.manual_seed(seed)
-    return HvsNetwork(Shape(cameras, state_dim, channels=8, hidden=32))
+    return HvsNetwork(
+        Shape(cameras, state_dim, channels=8, hidden=32, from_set_point=from_set_point)
+    )
 
 
 def inputs(cameras=CAMERAS, state_dim=14, n=5):
@@ -139,7 +141,8 @@ def test_every_subset_of_inputs_trains_and_acts(names, state_dim):
         loss = loss + sighting_loss(sighting, truth)
     loss.backward()
     assert all(torch.isfinite(p.grad).all() for p in net.parameters() if p.grad is not None)
-    action = net.to_action(out, state)
+    origin = None if state is None else net.origin(state, decision.memory)
+    action = net.to_action(out, origin)
     assert action.shape == (5, 7)
     assert (action.abs() <= 1.0).all()
 
@@ -158,7 +161,7 @@ def test_the_label_is_what_the_action_decodes_to():
     assert state is not None
     reachable = state[:, :7] + 0.05 * torch.randn(5, 7, generator=torch.Generator().manual_seed(0))
     action = reachable / torch.tensor(JOINT_RANGE_RAD, dtype=torch.float32)
-    decoded = net.to_action(net.encode_label(action, state), state)
+    decoded = net.to_action(net.encode_label(action, state[:, :7]), state[:, :7])
     torch.testing.assert_close(decoded, action, atol=1e-6, rtol=0.0)
 
 
@@ -176,19 +179,19 @@ def test_no_action_sends_the_flange_below_where_goals_lie():
         ]
     )
     step = 0.25 * torch.tensor([[1.0], [-1.0], [1.0], [1.0]]) * torch.eye(7)[1]
-    state = torch.cat([q, torch.zeros_like(q)], dim=1)
-    said = net.encode_label((q + step) / joint_range, state)
-    heights = geometry.flange_motion(net.to_action(said, state) * joint_range).position[:, 2]
+    said = net.encode_label((q + step) / joint_range, q)
+    heights = geometry.flange_motion(net.to_action(said, q) * joint_range).position[:, 2]
     assert (geometry.flange_motion(q + step).position[:3, 2] < 0.0).all()
     assert heights[:3].tolist() == pytest.approx([0.04] * 3, abs=2e-3)
     assert heights[3].item() == pytest.approx(0.084, abs=1e-3)
 
 
+@pytest.mark.parametrize("from_set_point", [False, True])
 @pytest.mark.parametrize("state_dim", [7, 14])
 @pytest.mark.parametrize("names", [("eih",), ("eth",), ("eih", "eth")])
-def test_compiled_the_network_decides_as_before(names, state_dim):
+def test_compiled_the_network_decides_as_before(names, state_dim, from_set_point):
     cameras = {name: CAMERAS[name] for name in names}
-    net = network(cameras, state_dim).eval()
+    net = network(cameras, state_dim, from_set_point=from_set_point).eval()
     images, state = inputs(cameras, state_dim, n=20)
     assert state is not None
     state[:, [1, 3, 5]] += torch.tensor([0.6, -1.4, 1.1])
@@ -199,18 +202,22 @@ def test_compiled_the_network_decides_as_before(names, state_dim):
     with torch.inference_mode():
         for i in range(len(state)):
             seen = {name: image[i : i + 1] for name, image in images.items()}
+            memory = None if i % 2 else memory
             decision = net(seen, state[i : i + 1], memory)
-            expected = net.to_action(decision.out, state[i : i + 1])
+            origin = net.origin(state[i : i + 1], decision.memory)
+            expected = net.to_action(decision.out, origin)
             made_of = features(seen, state[i : i + 1], memory)
             for made, known in zip(
-                made_of, (decision.out, decision.features, decision.memory), strict=True
+                made_of,
+                (decision.features[:, -7:], decision.features, decision.memory),
+                strict=True,
             ):
                 torch.testing.assert_close(made, known, atol=1e-6, rtol=0.0)
             action, memory = compiled(seen, state[i : i + 1], memory)
             torch.testing.assert_close(action, expected, atol=1e-6, rtol=0.0)
             after = net.commanded(decision.memory, expected)
             torch.testing.assert_close(memory, after, atol=1e-6, rtol=0.0)
-            unbounded = net.to_target(decision.out, state[i : i + 1]) / net.joint_range
+            unbounded = net.to_target(decision.out, origin) / net.joint_range
             raised.append(not torch.allclose(expected, unbounded.clamp(-1.0, 1.0), atol=1e-5))
     assert 0 < sum(raised) < len(raised)
 
@@ -223,7 +230,7 @@ def test_a_few_images_are_learned_by_heart():
         for name in CAMERAS
     }
     state = torch.from_numpy(columns["observation.state"])
-    label = net.encode_label(torch.from_numpy(columns["action"]), state)
+    label = net.encode_label(torch.from_numpy(columns["action"]), state[:, :7])
     truth = {name: torch.from_numpy(columns[f"privileged.target_{name}"]) for name in CAMERAS}
     optimizer = torch.optim.AdamW(net.parameters(), lr=3e-3)
     losses = []

@@ -21,10 +21,13 @@ BENT = torch.tensor([[0.0, 0.6, 0.0, -1.4, 0.0, 1.1, 0.0]])
 NOTHING = torch.zeros(1, 10)
 
 
-def network(visible_logit: float, eth_logit: float | None = None) -> HvsNetwork:
+def network(
+    visible_logit: float, eth_logit: float | None = None, from_set_point: bool = False
+) -> HvsNetwork:
     """A network whose eyes are sure that they see the target, or that they do not."""
     torch.manual_seed(0)
-    net = HvsNetwork(Shape(CAMERAS, 14, channels=8, hidden=32)).eval()
+    shape = Shape(CAMERAS, 14, channels=8, hidden=32, from_set_point=from_set_point)
+    net = HvsNetwork(shape).eval()
     with torch.no_grad():
         for name, eye in net.eyes.items():
             sure = visible_logit if name == "eih" or eth_logit is None else eth_logit
@@ -103,21 +106,24 @@ def test_the_set_point_moves_towards_each_action_as_fast_as_the_joints_may():
     assert far[0, -1] == 1.0
 
 
-def test_an_arm_that_is_on_its_way_already_is_not_sent_there_again():
+@pytest.mark.parametrize("from_set_point", [False, True])
+def test_an_arm_that_is_on_its_way_already_is_not_sent_there_again(from_set_point):
     """Steps are measured from where the arm will be: with latency it has not even begun to move."""
-    net = network(-20.0)
+    net = network(-20.0, from_set_point=from_set_point)
     with torch.no_grad():
         net.head[-1].weight.zero_()
-        for gain in (net.step_gain, net.stride_gain, net.onward_stride_gain):
-            gain.zero_()
-        net.onward_step_gain.fill_(1.0)
+        for name, parameter in net.named_parameters():
+            if name.endswith(("step_gain", "stride_gain")):
+                parameter.zero_()
+        (net.step_gain if from_set_point else net.onward_step_gain).fill_(1.0)
 
     def goes_to(set_point: torch.Tensor) -> torch.Tensor:
         memory = torch.cat([PLACE, PLACE, NOTHING[:, :2], set_point, torch.ones(1, 1)], dim=1)
         images = {name: torch.full((1, 3, 28, 28), 0.5) for name in CAMERAS}
         state = torch.cat([BENT, torch.zeros(1, 7)], dim=1)
         with torch.no_grad():
-            return BENT + net.to_step(net(images, state, memory).out)
+            decision = net(images, state, memory)
+            return net.origin(state, decision.memory) + net.to_step(decision.out)
 
     def distance(q: torch.Tensor) -> float:
         goal = PLACE[:, :3] + torch.tensor([[0.0, 0.0, 0.05]])
@@ -251,6 +257,21 @@ def test_where_the_arm_has_been_sent_is_remembered_also_what_it_has_not_begun_to
     sent = memory[:, SET_POINT] - off
     later = np.flatnonzero(number > latency)
     np.testing.assert_allclose(sent[later - latency], column["set_point"][later], atol=1e-5)
+
+
+def test_to_stay_where_the_arm_is_sent_is_no_step_at_all_however_far_it_has_yet_to_go():
+    net = network(-20.0, from_set_point=True)
+    ahead = BENT + 0.35 * torch.eye(7)[2]
+    memory = torch.cat([PLACE, PLACE, NOTHING[:, :2], ahead, torch.ones(1, 1)], dim=1)
+    images = {name: torch.full((1, 3, 28, 28), 0.5) for name in CAMERAS}
+    state = torch.cat([BENT, torch.zeros(1, 7)], dim=1)
+    with torch.no_grad():
+        origin = net.origin(state, net(images, state, memory).memory)
+    ranges = torch.tensor(JOINT_RANGE_RAD, dtype=torch.float32)
+    torch.testing.assert_close(
+        net.encode_label(ahead / ranges, origin), torch.zeros(1, 7), atol=1e-3, rtol=0.0
+    )
+    torch.testing.assert_close(net.to_action(torch.zeros(1, 7), origin), ahead / ranges)
 
 
 def test_the_height_that_joint_offsets_hide_shows_in_what_is_remembered():

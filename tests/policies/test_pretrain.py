@@ -12,6 +12,7 @@ from PIL import Image
 from safetensors.torch import load_file
 
 from hvs_suite.errors import DatasetError, OptionError, OutputError, PolicyError
+from hvs_suite.policies.checkpoint import load_network, read_config
 from hvs_suite.policies.demonstrations import Demonstrations, calibration_of, read_manifest
 from hvs_suite.policies.pretrain import pretrain
 
@@ -121,6 +122,20 @@ def test_of_few_demonstrations_the_cameras_are_known_from_those_alone(tmp_path):
     pretrain(tmp_path / "all", tmp_path / "out", steps=1, batch_size=4, episodes=60)
     rays = weights(tmp_path / "out")["network.rays"]
     np.testing.assert_allclose(rays, few.rays, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("latency", "executed"), [(0, True), (1, True), (1, False)])
+def test_with_latency_steps_are_counted_from_where_the_arm_was_sent(tmp_path, latency, executed):
+    columns = miniature.scene(40)
+    if executed:
+        columns["privileged.action_executed"] = columns["action"]
+    options = {"latency_steps": latency}
+    miniature.write_dataset(tmp_path / "data", columns, miniature.episodes(40), options=options)
+    pretrain(tmp_path / "data", tmp_path / "out", steps=2, batch_size=4)
+    config = json.loads((tmp_path / "out" / "config.json").read_text())
+    assert config["from_set_point"] == (latency > 0 and executed)
+    network = load_network(tmp_path / "out", read_config(tmp_path / "out"))
+    assert network.shape.from_set_point == config["from_set_point"]
 
 
 @pytest.mark.parametrize("inputs", [("eih", "joints"), ("eth",), ("eih", "eth")])
