@@ -198,13 +198,18 @@ def test_the_actor_knows_nothing_privileged(stage, base):
     assert values[0].shape == (4, 2)
 
 
-@pytest.mark.parametrize("latency", [0, 1, 2])
-def test_critics_see_where_a_command_leads(base, latency):
+@pytest.mark.parametrize(
+    ("latency", "from_set_point"), [(0, False), (1, False), (2, False), (1, True), (2, True)]
+)
+def test_critics_see_where_a_command_leads(base, latency, from_set_point):
     options = {**OPTIONS, "latency_steps": latency, "time_limit_steps": 9}
     own = AlignEnv("align-easy", split="dev", **options)
     dev = ResidualStage(own, base, bound=0.6, shaping=0.0, gamma=0.9)
+    network = load_base(base)
+    network.shape = dataclasses.replace(network.shape, from_set_point=from_set_point)
+    dev._network.shape = network.shape
     seen, _ = dev.reset(options={"scenario": 0})
-    ahead = Outlook(load_base(base), 0.6)
+    ahead = Outlook(network, 0.6)
     foreseen, came = [], []
     for _ in range(4 + latency):
         action = np.zeros(7, np.float32)
@@ -409,7 +414,7 @@ def test_what_plays_is_what_was_evaluated_best(base, tmp_path, monkeypatch, succ
 @pytest.mark.parametrize(
     "setting",
     [{"critics": 1}, {"noise": -0.1}, {"bound": 0.0}, {"gamma": 1.5}, {"collect_steps": 7},
-     {"eye_frames": 0}, {"actor_rate": float("nan")}],
+     {"eye_frames": 0}, {"actor_rate": float("nan")}, {"lost_share": 1.0}],
 )  # fmt: skip
 def test_settings_that_make_no_sense_are_refused(setting):
     with pytest.raises(OptionError):
