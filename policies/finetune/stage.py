@@ -152,7 +152,8 @@ class ResidualStage(gymnasium.Wrapper[Any, Any, Any, Any]):
         with one_torch_thread(), torch.inference_mode():
             images, self._state = network_inputs(self._network, observation)
             assert self._state is not None
-            self._out, features, self._memory = self._features(images, self._state, self._memory)
+            features, self._memory = self._features(images, self._state, self._memory)
+            self._out = features[:, -N_JOINTS:]
         return {
             FEATURES: features[0].numpy().copy(),
             PRIVILEGED: privileged_state(self._environment, self._network.shape.error_scale),

@@ -12,12 +12,12 @@ import torch
 from torch import Tensor, nn
 
 from hvs_suite.policies.hvs import geometry
-from hvs_suite.policies.hvs.network import N_JOINTS, Decision, HvsNetwork, memory_size
+from hvs_suite.policies.hvs.network import Decision, HvsNetwork, memory_size
 
 # TorchScript looks at what it runs before it settles how.
 _WARM_UP_CALLS = 3
 
-Says = Callable[[HvsNetwork, Decision, Tensor], tuple[Tensor, Tensor]]
+Says = Callable[[HvsNetwork, Decision, Tensor], tuple[Tensor, ...]]
 
 
 class CompiledNetwork:
@@ -62,7 +62,7 @@ class CompiledFeatures:
 
     def __call__(
         self, images: Mapping[str, Tensor], state: Tensor, memory: Tensor | None
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor]:
         """Look, as `HvsNetwork.forward` does.
 
         Args:
@@ -71,13 +71,14 @@ class CompiledFeatures:
             memory: See `HvsNetwork.forward`.
 
         Returns:
-            What a residual is added to, (1, 7), and ``features`` and ``memory`` of the `Decision`.
+            ``features`` and ``memory`` of the `Decision`.
         """
-        return self._features(images, state, memory)
+        features, memory = self._features(images, state, memory)
+        return features, memory
 
 
 class _Compiled:
-    """A network that says two things of its decision, traced and frozen for one observation."""
+    """A network that says something of its decision, traced and frozen for one observation."""
 
     def __init__(self, network: HvsNetwork, says: Says) -> None:
         self._cameras = tuple(network.shape.cameras)
@@ -99,9 +100,9 @@ class _Compiled:
 
     def __call__(
         self, images: Mapping[str, Tensor], state: Tensor, memory: Tensor | None
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, ...]:
         seen = tuple(images[name] for name in self._cameras)
-        result: tuple[Tensor, Tensor, Tensor] = self._frozen(
+        result: tuple[Tensor, ...] = self._frozen(
             seen, state, self._nothing if memory is None else memory
         )
         return result
@@ -117,8 +118,8 @@ class _Decides(nn.Module):
 
     def forward(
         self, images: tuple[Tensor, ...], state: Tensor, memory: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Two things about the decision, and the next memory."""
+    ) -> tuple[Tensor, ...]:
+        """What there is to say, and the next memory."""
         named = dict(zip(self._network.shape.cameras, images, strict=True))
         decision = self._network(named, state, memory)
         return *self._says(self._network, decision, state), decision.memory
@@ -131,6 +132,6 @@ def _commands(network: HvsNetwork, decision: Decision, state: Tensor) -> tuple[T
     return target, geometry.flange_motion(target).position[:, 2:]
 
 
-def _features(network: HvsNetwork, decision: Decision, state: Tensor) -> tuple[Tensor, Tensor]:
-    """What a residual is added to, and what it reads, which ends in that."""
-    return decision.features[:, -N_JOINTS:], decision.features
+def _features(network: HvsNetwork, decision: Decision, state: Tensor) -> tuple[Tensor]:
+    """What a residual reads."""
+    return (decision.features,)

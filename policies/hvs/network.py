@@ -472,20 +472,23 @@ class HvsNetwork(nn.Module):
         # From where the arm is sent: it trails its set point, and may not even have begun to move.
         pending = set_point - q
         sent = geometry.flange_motion(set_point)
-        begun = torch.zeros_like(q) if self.shape.from_set_point else pending
+        begun = set_point - self.origin(state, remembered)
         onward_step = begun + geometry.joint_step(sent, goals[0] - sent.position)
         onward_step = torch.asinh(onward_step / scale)
         onward = [torch.asinh((begun + w[-1]) / scale) for w in self._ways(set_point, goals)]
         later = [torch.asinh(pending / scale), onward_step, *onward]
-        strides = onward
+        # What geometry alone would do, each with its gain.
+        proposals = [(self.step_gain, onward_step, self.stride_gain, onward)]
         if not self.shape.from_set_point:
             strides = [torch.asinh(each / scale) for *_, each in ways]
-        stride, onward_stride = strides[0], onward[0]
+            proposals = [
+                (self.step_gain, step, self.stride_gain, strides),
+                (self.onward_step_gain, onward_step, self.onward_stride_gain, onward),
+            ]
+        unseen = torch.zeros_like(q[:, :1])
         if "eih" in sightings:
             unseen = 1.0 - remembered[:, SLOT_SIZE - 1 : SLOT_SIZE]
             features.append(unseen)
-            stride = stride + self.above_gain * unseen * (strides[1] - stride)
-            onward_stride = onward_stride + self.above_gain * unseen * (onward[1] - onward_stride)
             features.append(torch.asinh((depth - self.standoff) / scale))
             later.append(torch.asinh(height / scale))
         if self.shape.state_dim == POSITIONS_AND_VELOCITIES:
@@ -494,21 +497,19 @@ class HvsNetwork(nn.Module):
         in_flange = torch.asinh(offsets @ motion.rotation / scale)
         features.append(torch.cat([offsets, in_flange, estimates[:, :, 3:]], dim=2).flatten(1))
         inputs = torch.cat([*features, *later], dim=1)
-        if self.shape.from_set_point:
-            step = onward_step
-        out = self.head(inputs) + self.step_gain * step + self.stride_gain * stride
-        if not self.shape.from_set_point:
-            onward_out = self.onward_step_gain * onward_step
-            out = out + onward_out + self.onward_stride_gain * onward_stride
+        out = self.head(inputs)
+        for step_gain, straight, stride_gain, (stride, *above) in proposals:
+            for higher in above:
+                stride = stride + self.above_gain * unseen * (higher - stride)
+            out = out + step_gain * straight + stride_gain * stride
         if not self.training:
             # As long as all cameras are sure that the target is hidden, and none has seen it, the
             # head can know no way there. What it learns in training must not wait for eyes.
             has_seen = slots[:, SLOT_SIZE - 1 :: SLOT_SIZE].amax(dim=1) > 0
             for sighting in sightings.values():
                 has_seen = has_seen | (sighting.visible_logit[:, 0] > -SEEN_LOGIT)
-            there = self._look_out(set_point, self.origin(state, remembered))
-            out = torch.where(has_seen[:, None], out, there)
-        useful = self._within_reach(out, set_point - self.origin(state, remembered))
+            out = torch.where(has_seen[:, None], out, self._look_out(set_point, begun))
+        useful = self._within_reach(out, begun)
         out, known = self._with_residual(inputs, out, useful)
         return Decision(out, known, sightings, target, remembered, motion)
 
@@ -542,12 +543,12 @@ class HvsNetwork(nn.Module):
         """
         return memory[:, SET_POINT] if self.shape.from_set_point else state[:, :N_JOINTS]
 
-    def _look_out(self, set_point: Tensor, origin: Tensor) -> Tensor:
+    def _look_out(self, set_point: Tensor, begun: Tensor) -> Tensor:
         """The step to where a demonstrator looks for the target, each joint as fast as it can.
 
         Args:
             set_point: Where the arm has been sent, (B, 7) rad.
-            origin: From where the step is counted, (B, 7) rad.
+            begun: The set point, from where steps are counted, (B, 7) rad.
 
         Returns:
             As the head says it, (B, 7).
@@ -555,7 +556,7 @@ class HvsNetwork(nn.Module):
         bound = (CONTROL_PERIOD_S + LEAD_S) * self.joint_speed
         turns = torch.as_tensor(LOOK_OUT_RAD).to(set_point) - set_point
         turns[:, -1] = 0.0
-        step = set_point + turns.clamp(-bound, bound) - origin
+        step = begun + turns.clamp(-bound, bound)
         return torch.asinh(step / self.shape.error_scale)
 
     def _height(
@@ -594,22 +595,20 @@ class HvsNetwork(nn.Module):
             out = useful + self.shape.residual_bound * self.residual(known)
         return out, known
 
-    def _within_reach(self, out: Tensor, pending: Tensor) -> Tensor:
+    def _within_reach(self, out: Tensor, begun: Tensor) -> Tensor:
         """What of the head's output is of use: the set point moves only as fast as the joints may.
 
         Who asks for seven times that gets no more, but a residual that is added to it is lost.
 
         Args:
             out: (B, 7).
-            pending: The set point, from where steps are counted, (B, 7) rad.
+            begun: The set point, from where steps are counted, (B, 7) rad.
 
         Returns:
             The output nearest to it that is within a control step of the set point, (B, 7).
         """
         longest = self.joint_speed * CONTROL_PERIOD_S
-        ends = (
-            torch.asinh((pending + way) / self.shape.error_scale) for way in (-longest, longest)
-        )
+        ends = (torch.asinh((begun + way) / self.shape.error_scale) for way in (-longest, longest))
         return out.clamp(*ends)
 
     def _place(

@@ -207,11 +207,7 @@ def test_compiled_the_network_decides_as_before(names, state_dim, from_set_point
             origin = net.origin(state[i : i + 1], decision.memory)
             expected = net.to_action(decision.out, origin)
             made_of = features(seen, state[i : i + 1], memory)
-            for made, known in zip(
-                made_of,
-                (decision.features[:, -7:], decision.features, decision.memory),
-                strict=True,
-            ):
+            for made, known in zip(made_of, (decision.features, decision.memory), strict=True):
                 torch.testing.assert_close(made, known, atol=1e-6, rtol=0.0)
             action, memory = compiled(seen, state[i : i + 1], memory)
             torch.testing.assert_close(action, expected, atol=1e-6, rtol=0.0)
