@@ -48,8 +48,6 @@ LEAD_S = 0.025
 the fewest steps. More overshoots the goal, less arrives late."""
 
 _FULL_SPEED: FloatArray = robot.JOINT_SPEED_RAD_S[:6, None]
-_LAG_S: FloatArray = robot.DAMPING_NM_S_RAD / robot.STIFFNESS_NM_RAD
-"""Each joint trails a moving set point by kv / kp (s)."""
 _MAX_PATHS = 24
 _MAX_ESCAPES = 4
 _MAX_FLANGE_SPEED_M_S = 2.5
@@ -135,7 +133,6 @@ class Expert:
         """Of the present state."""
         self._soonest_s = math.inf
         """What the soonest way to the goal took a control step ago (s)."""
-        self._decay = np.exp(-self._period_s / _LAG_S)
         self._ruckig = ruckig.Ruckig(7)
         self._input = ruckig.InputParameter(7)
         self._input.max_velocity = list(robot.JOINT_SPEED_RAD_S)
@@ -186,20 +183,17 @@ class Expert:
     def _state_when_action_acts(self) -> tuple[FloatArray, FloatArray]:
         """True joint angles and velocities (7,), (7,) at the moment the action takes effect.
 
-        The set points still queued move the arm first. With time constant tau = kv / kp, a joint
-        that trails a set point on a ramp from s0 to s1 over T ends at
-        s1 - tau r + (q - s0 + tau r) exp(-T / tau), where r = (s1 - s0) / T.
+        The set points still queued move the arm first.
         """
         env = self._env
-        q, velocity = env.joint_positions, env.joint_velocities
-        set_point = env.setpoint
-        for queued in env.pending_setpoints:
-            arrived = robot.set_point_after(set_point, queued, self._period_s)
-            trail = _LAG_S * (arrived - set_point) / self._period_s
-            q = arrived - trail + (q - set_point + trail) * self._decay
-            velocity = (arrived - q) / _LAG_S
-            set_point = arrived
-        return np.asarray(q), np.asarray(velocity)
+        q, velocity, _ = robot.after_commands(
+            env.joint_positions,
+            env.joint_velocities,
+            env.setpoint,
+            env.pending_setpoints,
+            self._period_s,
+        )
+        return q, velocity
 
     def _next_set_point(
         self, q: FloatArray, velocity: FloatArray, position: FloatArray, normal: FloatArray

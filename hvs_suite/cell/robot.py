@@ -17,6 +17,7 @@ surfaces, objects  ``SCENE_BIT``         0
 """
 
 import dataclasses
+from collections.abc import Iterable
 from typing import Any, Literal
 
 import numpy as np
@@ -64,6 +65,8 @@ STIFFNESS_NM_RAD: FloatArray = np.array([21e3, 41e3, 9.9e3, 10.3e3, 520.0, 520.0
 """Position gain of each joint; gravity is compensated, so it carries no standing load."""
 DAMPING_NM_S_RAD: FloatArray = np.array([670.0, 1300.0, 298.0, 286.0, 17.2, 17.2, 15.6])
 """Velocity gain of each joint, on the joint's own speed: a moving set point leads by kv / kp."""
+LAG_S: FloatArray = DAMPING_NM_S_RAD / STIFFNESS_NM_RAD
+"""Each joint trails a moving set point by kv / kp (s)."""
 
 ROBOT_BIT = 1
 SCENE_BIT = 2
@@ -196,6 +199,38 @@ def set_point_after(set_point: FloatArray, command: FloatArray, period_s: float)
     """
     longest = JOINT_SPEED_RAD_S * period_s
     return np.asarray(set_point + np.clip(command - set_point, -longest, longest))
+
+
+def after_commands(
+    joints: FloatArray,
+    velocities: FloatArray,
+    set_point: FloatArray,
+    commands: Iterable[FloatArray],
+    period_s: float,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Where the arm is once commands that are under way have been carried out.
+
+    With time constant tau = kv / kp, a joint q that trails a set point on a ramp from s0 to s1 over
+    T ends at s1 - tau r + (q - s0 + tau r) exp(-T / tau), where r = (s1 - s0) / T.
+
+    Args:
+        joints: Now, (7,) rad.
+        velocities: Now, (7,) rad/s.
+        set_point: Now, (7,) rad.
+        commands: Joint positions asked for, (7,) rad each, one a control step.
+        period_s: Length of the control step (s).
+
+    Returns:
+        Joint positions (rad) and velocities (rad/s), and the set point (rad), (7,) each.
+    """
+    decay = np.exp(-period_s / LAG_S)
+    for command in commands:
+        arrived = set_point_after(set_point, command, period_s)
+        trail = LAG_S * (arrived - set_point) / period_s
+        joints = arrived - trail + (joints - set_point + trail) * decay
+        velocities = (arrived - joints) / LAG_S
+        set_point = arrived
+    return np.asarray(joints), np.asarray(velocities), set_point
 
 
 def _add_capsules(body: Any, name: str, capsules: tuple[_Capsule, ...], conaffinity: int) -> None:

@@ -16,7 +16,7 @@ import torch
 from gymnasium import spaces
 
 from hvs_suite.cell.kinematics import kinematics
-from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S, set_point_after
+from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S, after_commands
 from hvs_suite.policies.checkpoint import network_inputs
 from hvs_suite.policies.finetune.folding import load_base
 from hvs_suite.policies.hvs.compiled import CompiledFeatures
@@ -27,9 +27,11 @@ FEATURES = "features"
 """Key of what the actor reads: `Decision.features` of the base."""
 PRIVILEGED = "privileged"
 """Key of what only the critics read, see `privileged_state`."""
-PRIVILEGED_SIZE = 39
-JOINTS, GOAL, NORMAL, SENT = slice(0, N_JOINTS), slice(26, 29), slice(29, 32), slice(32, 39)
-"""Where true joint positions, the goal's place and normal, and the set point stand in it."""
+PRIVILEGED_SIZE = 46
+JOINTS, GOAL, NORMAL = slice(0, N_JOINTS), slice(26, 29), slice(29, 32)
+"""Where true joint positions, and the goal's place and normal stand in it."""
+COMING, SENT = slice(32, 39), slice(39, 46)
+"""Where joint positions and set point stand in it, as they will be when the action acts."""
 
 Observation = dict[str, npt.NDArray[np.float32]]
 
@@ -44,17 +46,21 @@ def privileged_state(environment: Any, error_scale: float) -> npt.NDArray[np.flo
     Returns:
         (39,): true joint positions and velocities in units of their limits, the way left to the
         goal in the base frame, the rotation vector from flange axis to inward normal, what is left
-        of the time, steps held, both cameras' targets, the goal's place (m) and normal, and the set
-        point that all actions so far lead to, in units of the joints' limits.
+        of the time, steps held, both cameras' targets, the goal's place (m) and normal, and joint
+        positions and set point that all actions so far lead to, in units of the joints' limits.
     """
     truth, info, variant = environment.privileged(), environment.info, environment.variant
     rotation, position = kinematics().flange_pose(truth["joint_positions"])
     way = truth["goal_position"] - position
     turn = np.cross(rotation[:, 2], -truth["goal_normal"])
     left = 1.0 - environment.control_steps / variant.time_limit_steps
-    sent = environment.setpoint
-    for queued in environment.pending_setpoints:
-        sent = set_point_after(sent, queued, variant.control_period_s)
+    coming, _, sent = after_commands(
+        environment.joint_positions,
+        environment.joint_velocities,
+        environment.setpoint,
+        environment.pending_setpoints,
+        variant.control_period_s,
+    )
     return np.concatenate(
         [
             truth["joint_positions"] / JOINT_RANGE_RAD,
@@ -66,6 +72,7 @@ def privileged_state(environment: Any, error_scale: float) -> npt.NDArray[np.flo
             truth["target_eth"][[2, 3]],
             truth["goal_position"],
             truth["goal_normal"],
+            coming / JOINT_RANGE_RAD,
             sent / JOINT_RANGE_RAD,
         ]
     ).astype(np.float32)
