@@ -1,6 +1,7 @@
-"""Writing files so that a reader never sees half of one."""
+"""Writing files so that a reader never sees half of one, and no second writer comes between."""
 
 import contextlib
+import fcntl
 import os
 import tempfile
 from collections.abc import Iterator
@@ -62,6 +63,29 @@ def check_writable(path: str | os.PathLike[str]) -> None:
         raise OutputError(f"{target} is a folder; name a file")
     if not os.access(target.parent, os.W_OK):
         raise OutputError(f"cannot write into {target.parent}; choose another path")
+
+
+@contextlib.contextmanager
+def only_writer(folder: Path) -> Iterator[None]:
+    """Be the only one that writes into a folder; ends with the process, however that ends.
+
+    Args:
+        folder: An existing folder.
+
+    Raises:
+        OutputError: Another process is.
+    """
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise OutputError(
+                f"another process is writing into {folder}; wait for it, or name another folder"
+            ) from None
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def _umask() -> int:

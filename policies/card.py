@@ -96,7 +96,7 @@ def describe(
         "inputs": inputs,
         "output": "`action` 7: joint position targets in units of the joint range",
         **(_rl_rows if was_fine_tuned else _imitation_rows)(settings, outcome),
-        "time": _time(outcome, trained["threads"], was_fine_tuned),
+        "time": _time(outcome, trained, was_fine_tuned),
         "seed": str(settings["seed"]),
         "licence": LICENCE,
     }
@@ -158,12 +158,19 @@ def _rl_rows(settings: Mapping[str, Any], outcome: Mapping[str, Any]) -> dict[st
     }
 
 
-def _time(outcome: Mapping[str, Any], threads: int, was_fine_tuned: bool) -> str:
+def _time(outcome: Mapping[str, Any], trained: Mapping[str, Any], was_fine_tuned: bool) -> str:
     """Hours of playing and learning; imitation counts its playing apart."""
     hours = (outcome["train_s"] + outcome.get("play_s", 0.0)) / 3600.0
-    learning = "one thread" if threads == 1 else f"{threads} threads"
-    left_out = "eyes and evaluations" if was_fine_tuned else "recording"
-    return f"{hours:.2f} h, learning on {learning}; {left_out} not counted"
+    if was_fine_tuned:
+        players = trained["settings"]["environments"]
+        where = f"{_count(players, 'process', 'processes')} playing while one learns"
+        return f"{hours:.2f} h, {where}; eyes and evaluations not counted"
+    learning = _count(trained["threads"], "thread", "threads")
+    return f"{hours:.2f} h, learning on {learning}; recording not counted"
+
+
+def _count(number: int, one: str, many: str) -> str:
+    return f"one {one}" if number == 1 else f"{number} {many}"
 
 
 def _results(results: list[Mapping[str, Any]]) -> list[str]:

@@ -35,7 +35,7 @@ from hvs_suite.policies.pretrain_settings import (
     take_eyes,
     tightest_scale,
 )
-from hvs_suite.policies.run_folder import claim, write_train_config
+from hvs_suite.policies.run_folder import claimed, write_train_config
 from hvs_suite.policies.training_plot import draw_run
 from hvs_suite.policies.training_state import Counters, load_state, save_state
 
@@ -187,39 +187,39 @@ def pretrain(
         manifest = manifest.with_inputs(inputs)
     keep_freed_memory()
     torch.set_num_threads(min(2, torch.get_num_threads()))
-    claim(out, dataclasses.asdict(settings))
-    training = out / "training"
-    policy = new_policy(manifest, settings)
-    if eyes is not None:
-        take_eyes(policy, eyes)
-    write_train_config(
-        out,
-        dataclasses.asdict(settings),
-        {"minutes": minutes, "steps": steps},
-        PACKAGES,
-        data=str(data),
-        policy={
-            "type": "hvs",
-            "channels": policy.config.channels,
-            "hidden": policy.config.hidden,
-            "weight_decay": policy.config.optimizer_weight_decay,
-        },
-    )
-    run = _Run(out, on_progress)
-    demonstrations = run.decode(manifest, training / "cache", settings)
-    run.train(
-        policy,
-        demonstrations,
-        settings,
-        budget=_Budget(steps, None if minutes is None else 60.0 * minutes),
-        rounds=_Rounds(training / "dagger", dagger_rounds, dagger_frames, workers),
-        checkpoint_period_s=checkpoint_period_s,
-    )
-    outcome = run.outcome(policy)
-    with replacing(training / "outcome.json") as temporary:
-        temporary.write_text(json.dumps(dataclasses.asdict(outcome), indent=2) + "\n")
-    draw_run(out)
-    return outcome
+    with claimed(out, dataclasses.asdict(settings)):
+        training = out / "training"
+        policy = new_policy(manifest, settings)
+        if eyes is not None:
+            take_eyes(policy, eyes)
+        write_train_config(
+            out,
+            dataclasses.asdict(settings),
+            {"minutes": minutes, "steps": steps},
+            PACKAGES,
+            data=str(data),
+            policy={
+                "type": "hvs",
+                "channels": policy.config.channels,
+                "hidden": policy.config.hidden,
+                "weight_decay": policy.config.optimizer_weight_decay,
+            },
+        )
+        run = _Run(out, on_progress)
+        demonstrations = run.decode(manifest, training / "cache", settings)
+        run.train(
+            policy,
+            demonstrations,
+            settings,
+            budget=_Budget(steps, None if minutes is None else 60.0 * minutes),
+            rounds=_Rounds(training / "dagger", dagger_rounds, dagger_frames, workers),
+            checkpoint_period_s=checkpoint_period_s,
+        )
+        outcome = run.outcome(policy)
+        with replacing(training / "outcome.json") as temporary:
+            temporary.write_text(json.dumps(dataclasses.asdict(outcome), indent=2) + "\n")
+        draw_run(out)
+        return outcome
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,29 +1,40 @@
 """The folder of a training run: whose it is, and what it was started with."""
 
+import contextlib
 import importlib.metadata
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from hvs_suite.errors import OutputError
-from hvs_suite.files import check_writable, replacing
+from hvs_suite.files import check_writable, only_writer, replacing
 
 CONFIG = "train_config.json"
 
 
-def claim(out: Path, settings: Mapping[str, Any]) -> None:
+@contextlib.contextmanager
+def claimed(out: Path, settings: Mapping[str, Any]) -> Iterator[None]:
     """Take a folder, or recognise it as an interrupted run with the same settings.
+
+    As long as the block lasts, nobody else can.
 
     Args:
         out: The folder; made if missing.
         settings: What the run is a function of, the budget aside.
 
     Raises:
-        OutputError: It cannot be written, or holds something else.
+        OutputError: It cannot be written, holds something else, or another process has it.
     """
+    check_writable(out / CONFIG)
+    with only_writer(out):
+        _check_same_run(out, settings)
+        yield
+
+
+def _check_same_run(out: Path, settings: Mapping[str, Any]) -> None:
+    """Refuse a folder that holds something else than an interrupted run with these settings."""
     config = out / CONFIG
-    check_writable(config)
     try:
         begun = json.loads(config.read_text())["settings"]
     except OSError:
@@ -50,7 +61,7 @@ def write_train_config(
     """Write ``train_config.json``, from which a run can be repeated.
 
     Args:
-        out: The claimed folder.
+        out: A `claimed` folder.
         settings: As claimed.
         budget: How long to train; may differ from one sitting to the next.
         packages: What trains; their versions are noted.

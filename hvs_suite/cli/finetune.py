@@ -35,6 +35,7 @@ class Finetune:
         noise: Standard deviation of the exploration, as a share of the bound.
         actor_rate: Learning rate of what is added.
         penalty: Weight of the squared share of the bound that is used.
+        gamma: Discount: the success that a step of haste may cost is 1 minus this.
         shaping: Weight of the potential beside the sparse reward: more for a policy that rarely
             reaches the goal, 0 for one that is good already.
         lost_share: Share of the episodes that play scenes again that were lost, once there are any:
@@ -60,6 +61,7 @@ class Finetune:
     noise: float = 0.2
     actor_rate: float = 1e-4
     penalty: float = 0.1
+    gamma: float = 0.97
     shaping: float = 0.05
     lost_share: float = 0.0
     updates: int = 20
@@ -81,6 +83,7 @@ class Finetune:
             noise=self.noise,
             actor_rate=self.actor_rate,
             penalty=self.penalty,
+            gamma=self.gamma,
             shaping=self.shaping,
             lost_share=self.lost_share,
             updates=self.updates,

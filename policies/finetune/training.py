@@ -41,7 +41,7 @@ from hvs_suite.policies.rl.curriculum import Curriculum, Kind, levels_of
 from hvs_suite.policies.rl.evaluation import Evaluation, Examiner
 from hvs_suite.policies.rl.journal import OUTCOMES, Journal
 from hvs_suite.policies.rl.run import Budget, Outcome, Progress, Run, check_run
-from hvs_suite.policies.run_folder import claim, write_train_config
+from hvs_suite.policies.run_folder import claimed, write_train_config
 from hvs_suite.registry import find
 from hvs_suite.rollout import library_seeds, worker_conditions
 from hvs_suite.tasks.variants import AlignVariant, with_options
@@ -116,17 +116,17 @@ def finetune(
         "seed": seed,
         **dataclasses.asdict(settings),
     }
-    claim(out, identity)
-    budget = {"minutes": minutes, "steps": steps}
-    write_train_config(out, identity, budget, PACKAGES, policy=name_of(policy))
-    training = out / "training"
-
-    def on_eyes(stage: str, share: float) -> None:
-        if on_progress is not None:
-            on_progress(Progress(stage, share, 0, 0, 0.0, math.nan, math.nan, None))
-
-    # Torch and SB3 draw from the global generators of NumPy and torch.
     with contextlib.ExitStack() as stack:
+        stack.enter_context(claimed(out, identity))
+        budget = {"minutes": minutes, "steps": steps}
+        write_train_config(out, identity, budget, PACKAGES, policy=name_of(policy))
+        training = out / "training"
+
+        def on_eyes(stage: str, share: float) -> None:
+            if on_progress is not None:
+                on_progress(Progress(stage, share, 0, 0, 0.0, math.nan, math.nan, None))
+
+        # Torch and SB3 draw from the global generators of NumPy and torch.
         stack.enter_context(library_seeds(seed))
         examiner = stack.enter_context(
             contextlib.closing(Examiner(variant, options, eval_episodes))

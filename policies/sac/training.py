@@ -20,7 +20,7 @@ from hvs_suite.policies.allocator import keep_freed_memory
 from hvs_suite.policies.rl.evaluation import Examiner
 from hvs_suite.policies.rl.journal import Journal, make_journal
 from hvs_suite.policies.rl.run import Budget, Outcome, Progress, Run, check_run
-from hvs_suite.policies.run_folder import claim, write_train_config
+from hvs_suite.policies.run_folder import claimed, write_train_config
 from hvs_suite.policies.sac.network import policy_kwargs
 from hvs_suite.policies.sac.playing import GreedyActor, save_actor, write_config
 from hvs_suite.policies.sac.settings import Settings
@@ -99,11 +99,11 @@ def train_sac(
         "seed": seed,
         **json.loads(json.dumps(dataclasses.asdict(settings))),
     }
-    claim(out, identity)
-    budget = {"minutes": minutes, "steps": steps}
-    write_train_config(out, identity, budget, PACKAGES, device=device)
-    # SB3 draws from the global generators of NumPy and torch.
     with contextlib.ExitStack() as stack:
+        stack.enter_context(claimed(out, identity))
+        budget = {"minutes": minutes, "steps": steps}
+        write_train_config(out, identity, budget, PACKAGES, device=device)
+        # SB3 draws from the global generators of NumPy and torch.
         stack.enter_context(library_seeds(seed))
         journal = stack.enter_context(
             contextlib.closing(make_journal(variant, options, split, seed))

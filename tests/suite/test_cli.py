@@ -292,3 +292,25 @@ def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(tmp_path):
         interrupted_write()
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_has_one_writer_until_that_ends_however_it_ends(tmp_path):
+    from hvs_suite.errors import OutputError
+    from hvs_suite.policies.run_folder import claimed
+
+    holds = (
+        "import pathlib, sys; from hvs_suite.files import only_writer\n"
+        "with only_writer(pathlib.Path(sys.argv[1])): print('mine', flush=True); sys.stdin.read()"
+    )
+    command = [sys.executable, "-c", holds, str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as writer:
+        assert writer.stdout is not None
+        assert writer.stdout.readline() == b"mine\n"
+        with (
+            pytest.raises(OutputError, match="another process is writing into"),
+            claimed(tmp_path, {}),
+        ):
+            pytest.fail("two have it")
+        writer.kill()
+    with claimed(tmp_path, {}):
+        pass
