@@ -51,9 +51,9 @@ def play(root, progress=None):
 def watched(root, episodes, pause_s=0.0, kill=False):
     """Runs a recorder until so many episodes are there, and then for a while, or to its end.
 
-    Counted in episodes, because no two recordings take the same time: what one took as long for as
-    the whole of another is cut short when the next episode is there. Returns its exit code, and the
-    seconds to its first episode and between the later ones.
+    Counted in episodes, because no two recordings take the same time; the while ends early with the
+    next episode, or a fast recording would be over. Returns its exit code, and the seconds to its
+    first episode and between the later ones.
     """
     reader, writer = os.pipe()
     moments = [time.monotonic()]
