@@ -91,7 +91,8 @@ def record(
         UnknownTaskError: There is no such task.
         OptionError: An option or a number makes no sense.
         ScenarioError: The split holds fewer scenarios.
-        OutputError: ``out`` is not empty without ``resume``, or cannot be written.
+        OutputError: ``out`` is not empty without ``resume``, cannot be written, or another process
+            records into it.
         DatasetError: What ``resume`` found was recorded otherwise.
     """
     variant = with_options(find(task), dict(options or {}))
@@ -110,50 +111,50 @@ def record(
     # PyArrow and the simulator load only once the arguments have passed.
     from hvs_suite.datasets.demonstration import Demonstrate, MakeEnvironment
     from hvs_suite.datasets.looking import make_demonstrator
-    from hvs_suite.datasets.writer import DatasetWriter, prepare_root, published_outcomes
+    from hvs_suite.datasets.writer import DatasetWriter, published_outcomes, taken
 
     if resume:
         _check_same_recording(root, metadata)
     missing = [folder for folder in (root, *root.parents) if not folder.exists()]
-    prepare_root(root, resume=resume)
-    outcomes = published_outcomes(root)
-    tracker = _Tracker(len(outcomes), sum(outcomes), episodes, progress)
-    fps = round(1.0 / variant.control_period_s)
-    writer = DatasetWriter(root, features, fps, variant.instruction, block)
-    played = play(
-        MakeEnvironment(task, split, dict(options or {})),
-        make_demonstrator,
-        range(len(outcomes), episodes),
-        Demonstrate(noise),
-        workers=workers,
-    )
-    try:
-        with contextlib.closing(played):
-            for demonstration in in_order(played, len(outcomes)):
-                # Not before there is something to keep: see below.
-                if tracker.frames == 0:
-                    write_metadata(root, metadata)
-                writer.save(demonstration)
-                tracker.saved(demonstration.length, demonstration.success)
-        writer.publish()
-    except KeyboardInterrupt:
-        writer.publish()
-        raise
-    except HvsError:
-        writer.publish()
-        raise
-    except OSError as error:
-        writer.discard()
-        saved = len(published_outcomes(root))
-        raise OutputError(
-            f"cannot write {root}: {error.strerror or error}; {saved} of {episodes} episodes are "
-            "saved, go on with --resume"
-        ) from error
-    finally:
-        # A recording that could not begin, for want of OpenGL say, leaves no trace.
-        for folder in missing:
-            with contextlib.suppress(OSError):
-                folder.rmdir()
+    with taken(root, resume=resume):
+        outcomes = published_outcomes(root)
+        tracker = _Tracker(len(outcomes), sum(outcomes), episodes, progress)
+        fps = round(1.0 / variant.control_period_s)
+        writer = DatasetWriter(root, features, fps, variant.instruction, block)
+        played = play(
+            MakeEnvironment(task, split, dict(options or {})),
+            make_demonstrator,
+            range(len(outcomes), episodes),
+            Demonstrate(noise),
+            workers=workers,
+        )
+        try:
+            with contextlib.closing(played):
+                for demonstration in in_order(played, len(outcomes)):
+                    # Not before there is something to keep: see below.
+                    if tracker.frames == 0:
+                        write_metadata(root, metadata)
+                    writer.save(demonstration)
+                    tracker.saved(demonstration.length, demonstration.success)
+            writer.publish()
+        except KeyboardInterrupt:
+            writer.publish()
+            raise
+        except HvsError:
+            writer.publish()
+            raise
+        except OSError as error:
+            writer.discard()
+            saved = len(published_outcomes(root))
+            raise OutputError(
+                f"cannot write {root}: {error.strerror or error}; {saved} of {episodes} episodes "
+                "are saved, go on with --resume"
+            ) from error
+        finally:
+            # A recording that could not begin, for want of OpenGL say, leaves no trace.
+            for folder in missing:
+                with contextlib.suppress(OSError):
+                    folder.rmdir()
     return tracker.state()
 
 

@@ -10,7 +10,7 @@ import dataclasses
 import json
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from hvs_suite.datasets.episode_stats import (
 )
 from hvs_suite.datasets.features import ROBOT_TYPE
 from hvs_suite.errors import DatasetError, OutputError
+from hvs_suite.files import only_writer
 
 STAGE = ".recording"
 """Hidden folder inside the dataset that holds the block being written."""
@@ -313,15 +314,19 @@ def _stats_of_episodes(listed: list[Path], names: list[str]) -> dict[str, Featur
     return {name: merge_stats(each) for name, each in parts.items()}
 
 
-def prepare_root(root: Path, *, resume: bool) -> None:
+@contextlib.contextmanager
+def taken(root: Path, *, resume: bool) -> Iterator[None]:
     """Makes sure that ``root`` can take a recording, and clears what a killed one left behind.
+
+    As long as the block lasts, nobody else can.
 
     Args:
         root: The dataset's folder.
         resume: Go on with what is there.
 
     Raises:
-        OutputError: It is a file, not writable, or not empty without ``resume``.
+        OutputError: It is a file, not writable, not empty without ``resume``, or another process
+            has it.
     """
     try:
         root.mkdir(parents=True, exist_ok=True)
@@ -334,8 +339,10 @@ def prepare_root(root: Path, *, resume: bool) -> None:
         raise OutputError(f"cannot write into {root}; choose another folder")
     if entries and not resume:
         raise OutputError(f"{root} is not empty; choose another folder, or go on with --resume")
-    shutil.rmtree(root / STAGE, ignore_errors=True)
-    _drop_unpublished(root)
+    with only_writer(root):
+        shutil.rmtree(root / STAGE, ignore_errors=True)
+        _drop_unpublished(root)
+        yield
 
 
 def published_outcomes(root: Path) -> list[bool]:

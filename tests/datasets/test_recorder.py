@@ -18,6 +18,7 @@ from hvs_suite.datasets.metadata import METADATA_FILE, read_metadata
 from hvs_suite.datasets.recorder import record
 from hvs_suite.datasets.writer import STAGE
 from hvs_suite.errors import DatasetError, OptionError, OutputError, RenderError, ScenarioError
+from hvs_suite.files import only_writer
 
 TASK = "align-fixed"
 N = 5
@@ -189,6 +190,13 @@ def test_a_folder_that_is_not_empty_is_not_overwritten(dataset, tmp_path):
     (tmp_path / "photo.png").touch()
     with pytest.raises(OutputError, match="no recording"):
         record(TASK, N, "train", tmp_path, resume=True)
+
+
+def test_a_folder_that_another_recorder_writes_is_left_alone(dataset):
+    before = sorted(dataset.rglob("*"))
+    with only_writer(dataset), pytest.raises(OutputError, match="another process"):
+        record(TASK, N + 1, "train", dataset, resume=True)
+    assert sorted(dataset.rglob("*")) == before
 
 
 def test_a_folder_that_cannot_be_made_is_one_clear_line(tmp_path):

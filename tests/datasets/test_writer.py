@@ -208,7 +208,8 @@ def test_a_kill_between_the_last_two_files_costs_no_more_than_the_block(
     write(torn, features, episodes[:3], 1)
     # As if the statistics of the third block had arrived, and its counts had not.
     lerobot_files.write_info(torn, features, FPS, ROBOT_TYPE, 2, sum(LENGTHS[:2]))
-    writer.prepare_root(torn, resume=True)
+    with writer.taken(torn, resume=True):
+        pass
     assert len(list((torn / "data").rglob("*.parquet"))) == 2
     files = DatasetWriter(torn, features, FPS, SENTENCE, 2)
     for scenario in (2, 3):
