@@ -36,8 +36,8 @@ class Finetune:
         actor_rate: Learning rate of what is added.
         penalty: Weight of the squared share of the bound that is used.
         gamma: Discount: the success that a step of haste may cost is 1 minus this.
-        shaping: Weight of the potential beside the sparse reward: more for a policy that rarely
-            reaches the goal, 0 for one that is good already.
+        shaping: Weight of the potential beside the sparse reward, which shows the way to a goal
+            that is rarely reached; 0 leaves the sparse reward alone.
         lost_share: Share of the episodes that play scenes again that were lost, once there are any:
             a policy that is good already learns from little else.
         updates: Updates while 40 environment steps are played; four times as many while the
@@ -62,7 +62,7 @@ class Finetune:
     actor_rate: float = 1e-4
     penalty: float = 0.1
     gamma: float = 0.97
-    shaping: float = 0.05
+    shaping: float = 0.01
     lost_share: float = 0.0
     updates: int = 20
     eval_every: int = 10_000

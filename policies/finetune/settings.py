@@ -58,7 +58,7 @@ class Settings:
     penalty: float = 0.1
     critics: int = 4
     hidden: int = 128
-    shaping: float = 0.05
+    shaping: float = 0.01
     eye_rounds: int = 2
     eye_frames: int = 6_000
     eye_steps: int = 1_000
