@@ -44,7 +44,7 @@ def privileged_state(environment: Any, error_scale: float) -> npt.NDArray[np.flo
         error_scale: Of the network (m); errors are read as asinh(x / this).
 
     Returns:
-        (39,): true joint positions and velocities in units of their limits, the way left to the
+        (46,): true joint positions and velocities in units of their limits, the way left to the
         goal in the base frame, the rotation vector from flange axis to inward normal, what is left
         of the time, steps held, both cameras' targets, the goal's place (m) and normal, and joint
         positions and set point that all actions so far lead to, in units of the joints' limits.
