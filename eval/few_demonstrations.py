@@ -11,9 +11,11 @@ import dataclasses
 import json
 import math
 import multiprocessing
+import os
 import queue
 import shutil
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -30,6 +32,15 @@ from hvs_suite.rollout import worker_conditions
 FINETUNED, IMITATED, SCRATCH = "RL fine-tuning", "more imitation", "RL from scratch"
 EVAL_EPISODES = 100
 """Scenes of an evaluation amid RL, at most."""
+WEAK_BASE: Mapping[str, Any] = {
+    "updates": 40,
+    "warm_up_steps": 1_000,
+    "bound": 1.2,
+    "noise": 0.1,
+    "penalty": 0.01,
+}
+"""What fine-tuning does otherwise than by default: a base that is far too slow must be changed by
+more than one that is good already (docs/experiments/few-demonstrations.md)."""
 GIGABYTES = ("cache", "dagger", "replay", "eyes")
 """Folders of a training that nobody asks for again."""
 
@@ -240,6 +251,18 @@ def _make_side_by_side(maker: "_Maker", counts: Sequence[int], report: Report) -
 def _report_to(reports: "multiprocessing.Queue[tuple[str, float, str]]") -> None:
     global _reports
     _reports = reports
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End this process once its parent has ended, however that was killed.
+
+    It would train on for an hour otherwise, and keep the folder from whoever goes on.
+    """
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def _report(stage: str, share: float, words: str) -> None:
@@ -293,6 +316,7 @@ class _Maker:
             eye_frames=max(1, budget.eye_frames // 2),
             eye_steps=budget.eye_steps,
             environments=1,
+            **WEAK_BASE,
         )
 
         def train(policy: Path, note: Note) -> None:

@@ -160,7 +160,7 @@ class FewDemonstrations:
     base_steps: int = 1_000
     imitation_steps: int = 2_500
     imitation_rounds: int = 4
-    eye_frames: int = 6_000
+    eye_frames: int = 4_000
     eye_steps: int = 500
     seeds: int = 3
     episodes: int = 200

@@ -1,6 +1,9 @@
 """From a few demonstrations: RL and its controls from the same bases, judged on the same scenes."""
 
 import dataclasses
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -39,6 +42,22 @@ def test_every_way_has_the_same_steps_and_is_not_made_twice(tmp_path):
     figure = few_demonstrations_report.draw(study)
     assert [axes.get_title(loc="left") for axes in figure.axes] == ["3 demonstrations"]
     assert len(figure.axes[0].lines) == 3
+
+
+def test_its_processes_end_with_a_study_that_is_killed(tmp_path):
+    endless = dataclasses.replace(BUDGET, base_steps=10**6)
+    script = (
+        "import os, signal\n"
+        "from pathlib import Path\n"
+        "from hvs_suite.eval.few_demonstrations import Budget, run_study\n"
+        "def stop(*words): os.kill(os.getpid(), signal.SIGKILL)\n"
+        f"run_study(Path({str(SAMPLE)!r}), Path({str(tmp_path)!r}), [3], {endless}, stop)\n"
+    )
+    # What it prints has an end only once all that could print have ended.
+    killed = subprocess.run(
+        [sys.executable, "-c", script], check=False, stdout=subprocess.PIPE, timeout=300
+    )
+    assert killed.returncode == -signal.SIGKILL
 
 
 @pytest.mark.parametrize("change", [{"seeds": 0}, {"env_steps": 40}, {"processes": 0}])
