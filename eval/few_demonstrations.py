@@ -18,17 +18,19 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pydantic
 
-from hvs_suite.errors import OptionError
+from hvs_suite.errors import OptionError, OutputError
 from hvs_suite.eval.comparison import Tally
 from hvs_suite.eval.result_file import Result
 from hvs_suite.eval.study_training import Report, earlier_result, judge
+from hvs_suite.files import replacing
 from hvs_suite.policies.demonstrations import read_manifest
 from hvs_suite.rollout import worker_conditions
 
+BASE = "base"
 FINETUNED, IMITATED, SCRATCH = "RL fine-tuning", "more imitation", "RL from scratch"
 EVAL_EPISODES = 100
 """Scenes of an evaluation amid RL, at most."""
@@ -41,8 +43,9 @@ WEAK_BASE: Mapping[str, Any] = {
 }
 """What fine-tuning does otherwise than by default: a base that is far too slow must be changed by
 more than one that is good already (docs/experiments/few-demonstrations.md)."""
-GIGABYTES = ("cache", "dagger", "replay", "eyes")
-"""Folders of a training that nobody asks for again."""
+STUDY_FILE = "study.json"
+GIGABYTES = ("cache", "dagger", "replay", "eyes/*/frames")
+"""Folders of a training that nobody asks for again, as patterns."""
 
 Note = Callable[[Any], None]
 
@@ -62,23 +65,46 @@ class Point(pydantic.BaseModel):
 
 
 class Curve(pydantic.BaseModel):
-    """One run of one way.
+    """How one way went on from a base, or from nothing.
 
     Attributes:
-        way: Which.
-        demonstrations: What its base learned from; 0 without a base.
-        seed: Of base and run.
         points: In order. The first is the base's and the last the end's, both on split ``dev``;
             between them RL was evaluated on ``validation``, and DAgger on each round's own scenes
             before it learned from them.
-        minutes: Playing and learning, the base's own training not counted (min).
+        minutes: Playing and learning on one core, evaluations not counted; imitation learns what
+            its base learned again (min).
     """
 
-    way: str
-    demonstrations: int
-    seed: int
     points: list[Point]
     minutes: float
+
+
+class End(pydantic.BaseModel):
+    """A finished policy on split ``dev``.
+
+    Attributes:
+        solved: For each scene in order, a 1 if it was solved and a 0 if not.
+        n_collision: Scenes that ended in a collision.
+    """
+
+    solved: Annotated[str, pydantic.Field(pattern="^[01]*$")]
+    n_collision: int
+
+
+class Family(pydantic.BaseModel):
+    """What came of one base, or of none.
+
+    Attributes:
+        demonstrations: What the base learned from; 0 without a base.
+        seed: Of base and runs.
+        curves: By way.
+        ends: By way, and of the base itself.
+    """
+
+    demonstrations: int
+    seed: int
+    curves: dict[str, Curve]
+    ends: dict[str, End]
 
 
 class Versus(pydantic.BaseModel):
@@ -87,7 +113,7 @@ class Versus(pydantic.BaseModel):
     Attributes:
         demonstrations: What the bases learned from.
         way: The first.
-        other: The second; ``base`` for the bases themselves.
+        other: The second.
         n_only_way: Scenes that the first alone solved.
         n_only_other: Scenes that the second alone solved.
         p: Of McNemar's exact test.
@@ -101,26 +127,6 @@ class Versus(pydantic.BaseModel):
     p: float
 
 
-class Study(pydantic.BaseModel):
-    """All curves, and what they have in common.
-
-    Attributes:
-        task: Named task.
-        env_steps: That each way has.
-        base_steps: Optimiser steps of each base.
-        seeds: How many.
-        curves: One for each way, number of demonstrations and seed.
-        comparisons: Of the ways at their ends.
-    """
-
-    task: str
-    env_steps: int
-    base_steps: int
-    seeds: int
-    curves: list[Curve]
-    comparisons: list[Versus]
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Budget:
     """What every run gets.
@@ -132,9 +138,7 @@ class Budget:
         imitation_rounds: Rounds that its environment steps are spread over.
         eye_frames: Environment steps of fine-tuning that train the eyes, in two rounds.
         eye_steps: Optimiser steps of each of them.
-        seeds: Runs of everything.
         episodes: Scenes of split ``dev`` that ends are judged on.
-        processes: Processes that make runs side by side, each on one core.
     """
 
     env_steps: int
@@ -143,9 +147,7 @@ class Budget:
     imitation_rounds: int
     eye_frames: int
     eye_steps: int
-    seeds: int
     episodes: int
-    processes: int
 
     def __post_init__(self) -> None:
         """Refuse what makes no sense.
@@ -163,58 +165,122 @@ class Budget:
             raise OptionError("env_steps must be more than eye_frames and imitation_rounds")
 
 
+class Study(pydantic.BaseModel):
+    """All that is finished.
+
+    Attributes:
+        task: Named task.
+        budget: What every run had.
+        families: By number of demonstrations, and by seed.
+    """
+
+    task: str
+    budget: Budget
+    families: list[Family]
+
+    def of(self, demonstrations: int) -> list[Family]:
+        """Returns the families of a number of demonstrations, one for each seed."""
+        return [each for each in self.families if each.demonstrations == demonstrations]
+
+    def counts(self) -> list[int]:
+        """Returns the numbers of demonstrations, in order."""
+        return sorted({family.demonstrations for family in self.families} - {0})
+
+    def comparisons(self) -> list[Versus]:
+        """Returns the ways against each other and against the base."""
+        pairs = ((FINETUNED, BASE), (IMITATED, BASE), (FINETUNED, IMITATED))
+        return [self._versus(count, *pair) for count in self.counts() for pair in pairs]
+
+    def _versus(self, count: int, way: str, other: str) -> Versus:
+        # The scenes of each seed's policies are the same; as pairs they are others.
+        sides = [
+            {
+                family.seed * self.budget.episodes + scene: solved == "1"
+                for family in self.of(count)
+                for scene, solved in enumerate(family.ends[name].solved)
+            }
+            for name in (way, other)
+        ]
+        tally = Tally.of(*sides)
+        return Versus(
+            demonstrations=count,
+            way=way,
+            other=other,
+            n_only_way=tally.n_only_a,
+            n_only_other=tally.n_only_b,
+            p=tally.p,
+        )
+
+
 def run_study(
-    data: Path, out: Path, counts: Sequence[int], budget: Budget, report: Report
+    data: Path,
+    out: Path,
+    counts: Sequence[int],
+    budget: Budget,
+    report: Report,
+    *,
+    seeds: int = 3,
+    processes: int = 2,
 ) -> Study:
     """Make every run, or go on where an earlier call was interrupted.
 
     Args:
         data: Recorded dataset, whose task is played.
-        out: Folder of the study.
+        out: Folder of the study. Its ``study.json`` keeps what is finished, and is all that is
+            needed to go on elsewhere with other numbers of demonstrations.
         counts: Numbers of demonstrations.
         budget: What every run gets.
         report: Called as the work goes on.
+        seeds: Runs of everything.
+        processes: Processes that make runs side by side, each on one core.
+
+    Returns:
+        The study, with all else that is finished in the folder.
 
     Raises:
         OptionError: A number makes no sense.
         DatasetError: The dataset cannot be trained on.
         OutputError: ``out`` cannot be written, or holds another study.
     """
+    for name, number in (("seeds", seeds), ("processes", processes)):
+        if number < 1:
+            raise OptionError(f"{name} must be at least 1, not {number}")
     manifest = read_manifest(data)
     for count in counts:
         if not 2 <= count <= manifest.n_episodes:
             raise OptionError(
                 f"demonstrations must be 2 to the dataset's {manifest.n_episodes}, not {count}"
             )
+    study = _begun(out / STUDY_FILE, Study(task=manifest.task, budget=budget, families=[]))
+    finished = {(family.demonstrations, family.seed) for family in study.families}
+    wanted = [(count, seed) for count in (*counts, 0) for seed in range(seeds)]
+
+    def keep(family: Family) -> None:
+        study.families.append(family)
+        study.families.sort(key=lambda each: (each.demonstrations, each.seed))
+        with replacing(out / STUDY_FILE) as temporary:
+            temporary.write_text(study.model_dump_json(indent=2) + "\n", encoding="utf-8")
+
     maker = _Maker(data, manifest.task, out, budget, report)
-    _make_side_by_side(maker, counts, report)
-    curves: list[Curve] = []
-    ends: dict[tuple[int, str], list[Result]] = {}
-    for seed in range(budget.seeds):
-        for count in counts:
-            base = maker.base(count, seed)
-            ends.setdefault((count, "base"), []).append(base)
-            for way, make in ((FINETUNED, maker.finetuned), (IMITATED, maker.imitated)):
-                points, end, minutes = make(count, seed)
-                ends.setdefault((count, way), []).append(end)
-                whole = [_point(0, base), *points, _point(budget.env_steps, end)]
-                curves.append(
-                    Curve(way=way, demonstrations=count, seed=seed, points=whole, minutes=minutes)
-                )
-        points, end, minutes = maker.scratch(seed)
-        whole = [*points, _point(budget.env_steps, end)]
-        curves.append(
-            Curve(way=SCRATCH, demonstrations=0, seed=seed, points=whole, minutes=minutes)
+    missing = [each for each in wanted if each not in finished]
+    _make_side_by_side(maker, missing, processes, keep)
+    return study
+
+
+def _begun(path: Path, new: Study) -> Study:
+    """The study that a file keeps, or a new one."""
+    if not path.exists():
+        return new
+    try:
+        study = Study.model_validate_json(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise OutputError(f"{path} is not of such a study; choose another folder") from error
+    if (study.task, study.budget) != (new.task, new.budget):
+        raise OutputError(
+            f"{path} is of another task or budget ({study.task}, {study.budget}); "
+            "give the same again, or choose another folder"
         )
-    pairs = ((FINETUNED, "base"), (IMITATED, "base"), (FINETUNED, IMITATED))
-    return Study(
-        task=manifest.task,
-        env_steps=budget.env_steps,
-        base_steps=budget.base_steps,
-        seeds=budget.seeds,
-        curves=curves,
-        comparisons=[_versus(count, way, other, ends) for count in counts for way, other in pairs],
-    )
+    return study
 
 
 _reports: "multiprocessing.Queue[tuple[str, float, str]]"
@@ -222,24 +288,27 @@ _reports: "multiprocessing.Queue[tuple[str, float, str]]"
 REPORTS_EVERY_S = 0.2
 
 
-def _make_side_by_side(maker: "_Maker", counts: Sequence[int], report: Report) -> None:
-    """Make all runs, those from the same base one after the other, in several processes."""
+def _make_side_by_side(
+    maker: "_Maker",
+    families: Sequence[tuple[int, int]],
+    processes: int,
+    keep: Callable[[Family], None],
+) -> None:
+    """Make families in several processes, the runs of each one after the other."""
     context = multiprocessing.get_context("spawn")
     reports: multiprocessing.Queue[tuple[str, float, str]] = context.Queue()
-    seeds = range(maker.budget.seeds)
-    families = [(count, seed) for count in counts for seed in seeds]
-    families += [(0, seed) for seed in seeds]
     silent = dataclasses.replace(maker, report=_report)
-    with ProcessPoolExecutor(maker.budget.processes, context, _report_to, (reports,)) as pool:
+    with ProcessPoolExecutor(processes, context, _report_to, (reports,)) as pool:
         with worker_conditions():
-            runs = [pool.submit(_make_family, silent, *family) for family in families]
+            waiting = {pool.submit(_make_family, silent, *family) for family in families}
         try:
-            while not all(run.done() for run in runs):
+            while waiting:
                 with contextlib.suppress(queue.Empty):
-                    report(*reports.get(timeout=REPORTS_EVERY_S))
-                for run in runs:
-                    if run.done():
-                        run.result()
+                    maker.report(*reports.get(timeout=REPORTS_EVERY_S))
+                done = {run for run in waiting if run.done()}
+                waiting -= done
+                for run in done:
+                    keep(run.result())
         except BaseException:
             # A run goes on where it is when the same command is given again.
             pool.shutdown(wait=False, cancel_futures=True)
@@ -269,13 +338,25 @@ def _report(stage: str, share: float, words: str) -> None:
     _reports.put((stage, share, words))
 
 
-def _make_family(maker: "_Maker", count: int, seed: int) -> None:
+def _make_family(maker: "_Maker", count: int, seed: int) -> Family:
     """Make a base and what comes of it; without demonstrations, the run that has none."""
+    family = Family(demonstrations=count, seed=seed, curves={}, ends={})
+    first = []
     if count:
-        for make in (maker.base, maker.finetuned, maker.imitated):
-            make(count, seed)
+        base = maker.base(count, seed)
+        first = [_point(0, base)]
+        family.ends[BASE] = _end(base)
+        runs = {
+            FINETUNED: maker.finetuned(count, seed),
+            IMITATED: maker.imitated(count, seed),
+        }
     else:
-        maker.scratch(seed)
+        runs = {SCRATCH: maker.scratch(seed)}
+    for way, (points, end, minutes) in runs.items():
+        whole = [*first, *points, _point(maker.budget.env_steps, end)]
+        family.curves[way] = Curve(points=whole, minutes=minutes)
+        family.ends[way] = _end(end)
+    return family
 
 
 @dataclasses.dataclass(frozen=True)
@@ -383,9 +464,7 @@ class _Maker:
         return _evaluated(training, 0), end, _minutes(training)
 
     def _folder(self, way: str, count: int, seed: int) -> Path:
-        # Another budget is another experiment and lies beside the first.
-        folder = self.out / f"steps-{self.budget.base_steps}-{self.budget.env_steps}"
-        return folder / f"seed-{seed}" / (f"{way}-{count}" if count else way)
+        return self.out / f"seed-{seed}" / (f"{way}-{count}" if count else way)
 
     def _made(
         self, way: str, count: int, seed: int, train: Callable[[Path, Note], None]
@@ -411,13 +490,17 @@ class _Maker:
                 scenarios=budget.episodes,
                 workers=1,
             )
-            for kept in GIGABYTES:
-                shutil.rmtree(training / kept, ignore_errors=True)
+            for pattern in GIGABYTES:
+                for folder in training.glob(pattern):
+                    shutil.rmtree(folder, ignore_errors=True)
         return training, result
 
 
 def _minutes(training: Path) -> float:
-    return float(json.loads((training / "outcome.json").read_text())["train_s"]) / 60.0
+    """What a training and, before it, the eyes' rounds took."""
+    outcomes = [training / "outcome.json", *training.glob("eyes/*/outcome.json")]
+    read = [json.loads(path.read_text(encoding="utf-8")) for path in outcomes]
+    return float(sum(each["train_s"] + each.get("play_s", 0.0) for each in read)) / 60.0
 
 
 def _evaluated(training: Path, played_before: int) -> list[Point]:
@@ -438,27 +521,8 @@ def _point(env_steps: int, result: Result) -> Point:
     return Point(env_steps=env_steps, n=summary.n_episodes, n_success=summary.n_success)
 
 
-def _versus(count: int, way: str, other: str, ends: dict[tuple[int, str], list[Result]]) -> Versus:
-    """Two ways on the same scenes from the same bases."""
-    sides = []
-    for name in (way, other):
-        outcomes = [
-            {row.scenario: row.success for row in result.episodes} for result in ends[count, name]
-        ]
-        # The scenes of each seed's policies are the same; as pairs they are others.
-        sides.append(
-            {
-                seed * len(rows) + scenario: success
-                for seed, rows in enumerate(outcomes)
-                for scenario, success in rows.items()
-            }
-        )
-    tally = Tally.of(*sides)
-    return Versus(
-        demonstrations=count,
-        way=way,
-        other=other,
-        n_only_way=tally.n_only_a,
-        n_only_other=tally.n_only_b,
-        p=tally.p,
+def _end(result: Result) -> End:
+    return End(
+        solved="".join("01"[row.success] for row in result.episodes),
+        n_collision=result.summary.n_collision,
     )

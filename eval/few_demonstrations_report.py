@@ -3,7 +3,15 @@
 from collections.abc import Sequence
 from typing import Any
 
-from hvs_suite.eval.few_demonstrations import FINETUNED, IMITATED, SCRATCH, Curve, Point, Study
+from hvs_suite.eval.few_demonstrations import (
+    BASE,
+    FINETUNED,
+    IMITATED,
+    SCRATCH,
+    Curve,
+    Point,
+    Study,
+)
 from hvs_suite.eval.study_training import SPLIT
 from hvs_suite.statistics import mean_rate_interval
 
@@ -18,23 +26,22 @@ def _pooled(points: Sequence[Point]) -> tuple[float, float, float]:
 
 
 def _curves(study: Study, way: str, count: int) -> list[Curve]:
-    wanted = 0 if way == SCRATCH else count
-    return [c for c in study.curves if (c.way, c.demonstrations) == (way, wanted)]
+    return [family.curves[way] for family in study.of(0 if way == SCRATCH else count)]
 
 
 def markdown(study: Study) -> str:
     """The study's tables."""
-    counts = sorted({curve.demonstrations for curve in study.curves} - {0})
+    budget = study.budget
     lines = [
-        f"`{study.task}`, split `{SPLIT}`, mean of {study.seeds} seeds with its 95 % interval: "
-        f"bases of {study.base_steps:,} optimiser steps, then {study.env_steps:,} environment "
-        "steps.",
+        f"`{study.task}`, {budget.episodes} scenes of split `{SPLIT}`, mean of the seeds with its "
+        f"95 % interval: bases of {budget.base_steps:,} optimiser steps, then "
+        f"{budget.env_steps:,} environment steps.",
         "",
-        f"| demonstrations | base | {FINETUNED} | of the gap closed | minutes | {IMITATED} "
+        f"| demonstrations | seeds | base | {FINETUNED} | of the gap closed | minutes | {IMITATED} "
         f"| minutes | {SCRATCH} |",
-        "|---|---|---|---|---|---|---|---|",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
-    for count in counts:
+    for count in study.counts():
         tuned, imitated, scratch = (_curves(study, way, count) for way in COLOURS)
         base = _pooled([curve.points[0] for curve in tuned])
         ends = [_pooled([c.points[-1] for c in way]) for way in (tuned, imitated, scratch)]
@@ -42,8 +49,8 @@ def markdown(study: Study) -> str:
         minutes = [sum(c.minutes for c in way) / len(way) for way in (tuned, imitated)]
         cells = [f"{mean:.1f} % ({low:.1f} to {high:.1f})" for mean, low, high in (base, *ends)]
         lines.append(
-            f"| {count} | {cells[0]} | {cells[1]} | {100 * closed:.0f} % | {minutes[0]:.0f} "
-            f"| {cells[2]} | {minutes[1]:.0f} | {cells[3]} |"
+            f"| {count} | {len(tuned)} | {cells[0]} | {cells[1]} | {100 * closed:.0f} % "
+            f"| {minutes[0]:.0f} | {cells[2]} | {minutes[1]:.0f} | {cells[3]} |"
         )
     lines += [
         "",
@@ -53,8 +60,19 @@ def markdown(study: Study) -> str:
     lines += [
         f"| {row.demonstrations} | {row.way}, {row.other} | {row.n_only_way}, {row.n_only_other} "
         f"| {row.p:.2g} |"
-        for row in study.comparisons
+        for row in study.comparisons()
     ]
+    lines += [
+        "",
+        f"| demonstrations | collisions: {BASE} | {FINETUNED} | {IMITATED} |",
+        "|---|---|---|---|",
+    ]
+    for count in study.counts():
+        cells = [
+            str(sum(family.ends[way].n_collision for family in study.of(count)))
+            for way in (BASE, FINETUNED, IMITATED)
+        ]
+        lines.append(f"| {count} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
@@ -66,7 +84,7 @@ def draw(study: Study) -> Any:
     """
     from matplotlib.figure import Figure
 
-    counts = sorted({curve.demonstrations for curve in study.curves} - {0})
+    counts = study.counts()
     size = (3.4 * len(counts) + 0.6, 3.6)
     figure = Figure(figsize=size, dpi=130, facecolor="white", layout="constrained")
     for axes, count in zip(

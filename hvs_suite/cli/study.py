@@ -135,7 +135,8 @@ class FewDemonstrations:
 
     Bases learn from a few demonstrations by cloning alone. From each, RL fine-tuning and DAgger get
     the same number of environment steps; RL from scratch gets them without a base. Interrupted, the
-    same command goes on.
+    same command goes on; what is finished is kept in study.json, which alone is enough to go on
+    with other numbers of demonstrations on another machine.
 
     Attributes:
         data: Recorded dataset; its task is played.
@@ -179,13 +180,19 @@ class FewDemonstrations:
             imitation_rounds=self.imitation_rounds,
             eye_frames=self.eye_frames,
             eye_steps=self.eye_steps,
-            seeds=self.seeds,
             episodes=self.episodes,
-            processes=self.processes,
         )
         counts = self.demonstrations or (25, 50, 100, 200)
         with console.meter() as update:
-            study = few_demonstrations.run_study(self.data, self.out, counts, budget, update)
+            study = few_demonstrations.run_study(
+                self.data,
+                self.out,
+                counts,
+                budget,
+                update,
+                seeds=self.seeds,
+                processes=self.processes,
+            )
         text = few_demonstrations_report.markdown(study)
         figure = few_demonstrations_report.draw(study)
         _write(self.out, study.model_dump_json(indent=2), text, figure)

@@ -5,8 +5,10 @@ that the eyes are trained on; head and residual stay as they are. A residual on 
 what the features have lost.
 """
 
+import json
 import math
 import sys
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -64,7 +66,8 @@ def train_eyes(
 
     Args:
         base: Checkpoint to begin with.
-        folder: Gets a folder a round: its frames, and the checkpoint that came of it; and
+        folder: Gets a folder a round: its frames, the checkpoint that came of it, and
+            ``outcome.json`` with the seconds of the sitting that finished it; and
             ``evaluations.json``, of the base and of each round.
         variant: The named task.
         options: Task options that differ from it.
@@ -95,6 +98,7 @@ def train_eyes(
         folder.mkdir(parents=True, exist_ok=True)
         success = success_of(base, 0)
     for number in range(settings.eye_rounds):
+        began = time.perf_counter()
         place = folder / f"round-{number + 1}"
         frames = place / "frames"
         if read_round(frames) is None:
@@ -126,6 +130,8 @@ def train_eyes(
         if not (improved / "config.json").exists():
             network = load_base(best)
             _train(network, pool, settings, [seed, number], on_share)
+            seconds = {"train_s": time.perf_counter() - began}
+            (place / "outcome.json").write_text(json.dumps(seconds), encoding="utf-8")
             write_folded(best, network, improved)
         solved = success_of(improved, number + 1)
         if solved >= success:
