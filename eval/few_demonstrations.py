@@ -221,6 +221,7 @@ def run_study(
     *,
     seeds: int = 3,
     processes: int = 2,
+    on_finished: Callable[[Study], None] | None = None,
 ) -> Study:
     """Make every run, or go on where an earlier call was interrupted.
 
@@ -233,6 +234,7 @@ def run_study(
         report: Called as the work goes on.
         seeds: Runs of everything.
         processes: Processes that make runs side by side, each on one core.
+        on_finished: Called with all that is finished, each time that is more.
 
     Returns:
         The study, with all else that is finished in the folder.
@@ -260,6 +262,8 @@ def run_study(
         study.families.sort(key=lambda each: (each.demonstrations, each.seed))
         with replacing(out / STUDY_FILE) as temporary:
             temporary.write_text(study.model_dump_json(indent=2) + "\n", encoding="utf-8")
+        if on_finished is not None:
+            on_finished(study)
 
     maker = _Maker(data, manifest.task, out, budget, report)
     missing = [each for each in wanted if each not in finished]

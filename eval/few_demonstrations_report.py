@@ -25,12 +25,20 @@ def _pooled(points: Sequence[Point]) -> tuple[float, float, float]:
     return 100.0 * sum(k / n for k, n in counts) / len(counts), low, high
 
 
+def _cell(points: Sequence[Point]) -> str:
+    """Mean success and its interval; nothing for a way that is not finished for any seed."""
+    if not points:
+        return ""
+    mean, low, high = _pooled(points)
+    return f"{mean:.1f} % ({low:.1f} to {high:.1f})"
+
+
 def _curves(study: Study, way: str, count: int) -> list[Curve]:
     return [family.curves[way] for family in study.of(0 if way == SCRATCH else count)]
 
 
 def markdown(study: Study) -> str:
-    """The study's tables."""
+    """The study's tables, of what is finished."""
     budget = study.budget
     lines = [
         f"`{study.task}`, {budget.episodes} scenes of split `{SPLIT}`, mean of the seeds with its "
@@ -43,11 +51,12 @@ def markdown(study: Study) -> str:
     ]
     for count in study.counts():
         tuned, imitated, scratch = (_curves(study, way, count) for way in COLOURS)
-        base = _pooled([curve.points[0] for curve in tuned])
-        ends = [_pooled([c.points[-1] for c in way]) for way in (tuned, imitated, scratch)]
-        closed = (ends[0][0] - base[0]) / max(1e-9, 100.0 - base[0])
+        bases = [curve.points[0] for curve in tuned]
+        ends = [[curve.points[-1] for curve in way] for way in (tuned, imitated, scratch)]
+        before, after = _pooled(bases)[0], _pooled(ends[0])[0]
+        closed = (after - before) / max(1e-9, 100.0 - before)
         minutes = [sum(c.minutes for c in way) / len(way) for way in (tuned, imitated)]
-        cells = [f"{mean:.1f} % ({low:.1f} to {high:.1f})" for mean, low, high in (base, *ends)]
+        cells = [_cell(points) for points in (bases, *ends)]
         lines.append(
             f"| {count} | {len(tuned)} | {cells[0]} | {cells[1]} | {100 * closed:.0f} % "
             f"| {minutes[0]:.0f} | {cells[2]} | {minutes[1]:.0f} | {cells[3]} |"
@@ -79,6 +88,9 @@ def markdown(study: Study) -> str:
 def draw(study: Study) -> Any:
     """Success against environment steps, a panel for each number of demonstrations.
 
+    Args:
+        study: What is finished; at least one base.
+
     Returns:
         A ``matplotlib.figure.Figure``.
     """
@@ -92,6 +104,8 @@ def draw(study: Study) -> Any:
     ):
         for way, colour in COLOURS.items():
             curves = _curves(study, way, count)
+            if not curves:
+                continue
             # A run that was ended early has fewer points than its sisters.
             steps = sorted(set.intersection(*({p.env_steps for p in c.points} for c in curves)))
             pooled = [

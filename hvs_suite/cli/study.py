@@ -60,6 +60,7 @@ class Compression:
             study = compression_study.run_study(data, self.out, encodings, training, update)
         text = compression_report.markdown(study)
         _write(self.out, study.model_dump_json(indent=2), text, compression_report.draw(study))
+        _say(self.out, text)
 
     def _recorded(self) -> Path:
         """The study's own recording, gone on with where it was interrupted."""
@@ -127,6 +128,7 @@ class Ablation:
             study = ablation_study.run_study(self.data, self.out, rows, budget, update)
         text = ablation_study.markdown(study)
         _write(self.out, study.model_dump_json(indent=2), text, ablation_study.draw(study))
+        _say(self.out, text)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -135,8 +137,8 @@ class FewDemonstrations:
 
     Bases learn from a few demonstrations by cloning alone. From each, RL fine-tuning and DAgger get
     the same number of environment steps; RL from scratch gets them without a base. Interrupted, the
-    same command goes on; what is finished is kept in study.json, which alone is enough to go on
-    with other numbers of demonstrations on another machine.
+    same command goes on; tables and picture show what is finished so far, and study.json alone is
+    enough to go on with other numbers of demonstrations on another machine.
 
     Attributes:
         data: Recorded dataset; its task is played.
@@ -183,6 +185,14 @@ class FewDemonstrations:
             episodes=self.episodes,
         )
         counts = self.demonstrations or (25, 50, 100, 200)
+
+        def write(study: few_demonstrations.Study) -> None:
+            # RL from scratch has no place of its own: it is a control of each base.
+            if study.counts():
+                text = few_demonstrations_report.markdown(study)
+                figure = few_demonstrations_report.draw(study)
+                _write(self.out, study.model_dump_json(indent=2), text, figure)
+
         with console.meter() as update:
             study = few_demonstrations.run_study(
                 self.data,
@@ -192,10 +202,10 @@ class FewDemonstrations:
                 update,
                 seeds=self.seeds,
                 processes=self.processes,
+                on_finished=write,
             )
-        text = few_demonstrations_report.markdown(study)
-        figure = few_demonstrations_report.draw(study)
-        _write(self.out, study.model_dump_json(indent=2), text, figure)
+        write(study)
+        _say(self.out, few_demonstrations_report.markdown(study))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -238,7 +248,7 @@ class Attention:
 
 
 def _write(out: Path, content: str, text: str, figure: Any) -> None:
-    """Write a study as JSON, Markdown and picture, and print its table."""
+    """Write a study as JSON, Markdown and picture."""
     from hvs_suite.files import replacing
 
     for name, written in (("study.json", content + "\n"), ("study.md", text)):
@@ -246,6 +256,10 @@ def _write(out: Path, content: str, text: str, figure: Any) -> None:
             temporary.write_text(written, encoding="utf-8")
     with replacing(out / "study.png") as temporary:
         figure.savefig(temporary)
+
+
+def _say(out: Path, text: str) -> None:
+    """Print a study's tables, and where it is written."""
     print(text, end="")
     print(f"wrote {out / 'study.json'}, study.md and study.png")
 

@@ -34,7 +34,15 @@ pytestmark = pytest.mark.timeout(600)
 
 
 def test_every_way_has_the_same_steps_and_is_not_made_twice(tmp_path):
-    study = run_study(SAMPLE, tmp_path / "a", [3], BUDGET, lambda *words: None, seeds=1)
+    so_far = []
+
+    def on_finished(study):
+        so_far.append(len(study.families))
+
+    study = run_study(
+        SAMPLE, tmp_path / "a", [3], BUDGET, lambda *words: None, seeds=1, on_finished=on_finished
+    )
+    assert so_far == [1, 2]
     assert study.counts() == [3]
     ways = study.of(3)[0].curves | study.of(0)[0].curves
     assert set(ways) == {FINETUNED, IMITATED, SCRATCH}
@@ -114,6 +122,14 @@ def test_all_that_is_finished_is_reported(kept):
     assert "| 3 | 2 | 50.0 %" in text
     assert "| 4 | 1 | 50.0 %" in text
     assert len(few_demonstrations_report.draw(study).axes) == 2
+
+
+def test_what_is_finished_is_reported_before_its_control_is():
+    study = Study(task="align-thesis", budget=BUDGET, families=[_family(3, 0, tuned=1)])
+    text = few_demonstrations_report.markdown(study)
+    assert text.count("| 3 | 1 | 50.0 %") == 1
+    assert text.splitlines()[4].endswith("|  |")
+    assert len(few_demonstrations_report.draw(study).axes[0].lines) == 2
 
 
 def test_another_study_in_the_folder_is_left_alone(kept):
