@@ -9,6 +9,7 @@ import json
 import math
 import sys
 import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
@@ -34,6 +35,8 @@ from hvs_suite.tasks.scenario import TEST_SPLIT
 
 LOG_EVERY = 10
 """Iterations between two points of a curve."""
+RECENT = 100
+"""Iterations that a rate is of; before anything is learned a run is many times faster."""
 
 
 class Learner(Protocol):
@@ -66,8 +69,9 @@ class Progress:
         share: Part of the stage that is done, 0 to 1.
         env_steps: Environment steps over all sittings.
         updates: Updates over all sittings.
-        env_steps_per_s: Rate in this sitting, evaluations not counted.
-        seconds_left: Of the budget, at the rate of this sitting (s).
+        env_steps_per_s: Rate of late, evaluations not counted; 0 before anything was played.
+        seconds_left: Of the budget, at the rate of late, evaluations not counted (s); NaN before
+            anything was played.
         episode_return: Mean of the last hundred episodes; NaN before the first has ended.
         evaluation: The last one; None before.
     """
@@ -208,7 +212,8 @@ class Run:
         self._examiner = examiner
         self._on_progress = on_progress
         self._counters: Counters = load_run(self._training, model)
-        self._begun = (model.num_timesteps, self._counters.elapsed_s)
+        # Share of the budget, environment steps and seconds after each of the last iterations.
+        self._recent: deque[tuple[float, int, float]] = deque(maxlen=RECENT + 1)
         self._evaluations = read_evaluations(
             self._training / "evaluations.json", model.num_timesteps
         )
@@ -231,7 +236,8 @@ class Run:
             checkpoint_period_s: Time between checkpoints (s).
         """
         model, counters = self._model, self._counters
-        begun = share = budget.share(model.num_timesteps, counters.elapsed_s)
+        share = budget.share(model.num_timesteps, counters.elapsed_s)
+        self._recent.append((share, model.num_timesteps, counters.elapsed_s))
         if not self._evaluations:
             self._evaluate()
             self._checkpoint()
@@ -244,6 +250,7 @@ class Run:
             counters.elapsed_s += time.perf_counter() - started
             iterations += 1
             share = budget.share(model.num_timesteps, counters.elapsed_s)
+            self._recent.append((share, model.num_timesteps, counters.elapsed_s))
             if iterations % LOG_EVERY == 0 or share >= 1.0:
                 self._log()
             evaluated = self._evaluations[-1].env_steps
@@ -254,8 +261,7 @@ class Run:
             if time.perf_counter() - last_checkpoint >= checkpoint_period_s:
                 self._checkpoint()
                 last_checkpoint = time.perf_counter()
-            used = (share - begun) / max(1e-9, counters.elapsed_s - self._begun[1])
-            self._report("training", share, max(0.0, 1.0 - share) / max(1e-12, used))
+            self._report("training", share)
         draw_rl_run(self._training, self._evaluations)
 
     def outcome(self) -> Outcome:
@@ -284,7 +290,7 @@ class Run:
             env_steps,
             self._model._n_updates,
             self._training / "clips" / f"{env_steps:010d}.mp4",
-            lambda done: self._report("evaluating", done / self._examiner.episodes, 0.0),
+            lambda done: self._report("evaluating", done / self._examiner.episodes),
         )
         self._evaluations.append(evaluation)
         write_evaluations(self._training / "evaluations.json", self._evaluations)
@@ -310,19 +316,23 @@ class Run:
         )
         model.dump_logs()
 
-    def _report(self, stage: str, share: float, seconds_left: float) -> None:
+    def _report(self, stage: str, share: float) -> None:
         if self._on_progress is None:
             return
         recent = [float(episode["r"]) for episode in self._model.ep_info_buffer or ()]
-        steps = self._model.num_timesteps - self._begun[0]
+        (share_then, steps_then, then), (share_now, steps_now, now) = (
+            self._recent[0],
+            self._recent[-1],
+        )
+        used = share_now - share_then
         self._on_progress(
             Progress(
                 stage=stage,
                 share=share,
                 env_steps=self._model.num_timesteps,
                 updates=self._model._n_updates,
-                env_steps_per_s=steps / max(1e-9, self._counters.elapsed_s - self._begun[1]),
-                seconds_left=seconds_left,
+                env_steps_per_s=(steps_now - steps_then) / max(1e-9, now - then),
+                seconds_left=max(0.0, 1.0 - share_now) * (now - then) / used if used else math.nan,
                 episode_return=sum(recent) / len(recent) if recent else math.nan,
                 evaluation=self._evaluations[-1] if self._evaluations else None,
             )

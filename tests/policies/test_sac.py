@@ -128,6 +128,9 @@ def test_a_run_counts_what_it_did(whole):
     assert outcome.updates_per_env_step == pytest.approx(6 / 42)
     assert [r.env_steps for r in reports if r.stage == "training"] == list(range(6, 43, 6))
     assert reports[-1].share == 1.0
+    left = [report.seconds_left for report in reports if report.stage == "training"]
+    assert all(seconds > 0.0 for seconds in left[:-1])
+    assert left[-1] == 0.0
     told = json.loads((out / "training" / "outcome.json").read_text())
     assert (told["step"], told["env_steps"]) == (outcome.step, STEPS)
     assert told["n_parameters"] == outcome.n_parameters > 1000
