@@ -102,7 +102,8 @@ def draw(study: Study) -> Any:
     for axes, count in zip(
         figure.subplots(1, len(counts), sharey=True, squeeze=False)[0], counts, strict=True
     ):
-        for way, colour in COLOURS.items():
+        # What the study is about lies on top.
+        for way, colour in reversed(COLOURS.items()):
             curves = _curves(study, way, count)
             if not curves:
                 continue
@@ -117,10 +118,10 @@ def draw(study: Study) -> Any:
             axes.plot(thousands, means, color=colour, marker="o", markersize=3, label=way)
             axes.fill_between(thousands, lows, highs, color=colour, alpha=0.15, linewidth=0)
         axes.set_title(f"{count} demonstrations", fontsize=9, loc="left")
-        axes.set(xlabel="environment steps (thousands)", ylim=(0.0, 102.0))
+        axes.set(xlabel="environment steps (thousands)", ylim=(-2.0, 102.0))
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", color="#e4e4e2", linewidth=0.6)
     figure.axes[0].set_ylabel("solved (%)")
-    figure.axes[0].legend(fontsize=7, frameon=False, loc="lower right")
+    figure.axes[0].legend(fontsize=7, frameon=False, loc="center right")
     figure.suptitle(f"{study.task}: from a few demonstrations", fontsize=10, x=0.01, ha="left")
     return figure
