@@ -221,7 +221,7 @@ def run_study(
     *,
     seeds: int = 3,
     processes: int = 2,
-    on_finished: Callable[[Study], None] | None = None,
+    on_finished: Callable[[Study], object] | None = None,
 ) -> Study:
     """Make every run, or go on where an earlier call was interrupted.
 

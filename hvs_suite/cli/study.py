@@ -58,8 +58,9 @@ class Compression:
         data = self._recorded() if self.data is None else self.data
         with console.meter() as update:
             study = compression_study.run_study(data, self.out, encodings, training, update)
+        _write_json(self.out, study)
         text = compression_report.markdown(study)
-        _write(self.out, study.model_dump_json(indent=2), text, compression_report.draw(study))
+        _write_report(self.out, text, compression_report.draw(study))
         _say(self.out, text)
 
     def _recorded(self) -> Path:
@@ -126,8 +127,9 @@ class Ablation:
         rows = self.row or tuple(ablation_study.ABLATIONS)
         with console.meter() as update:
             study = ablation_study.run_study(self.data, self.out, rows, budget, update)
+        _write_json(self.out, study)
         text = ablation_study.markdown(study)
-        _write(self.out, study.model_dump_json(indent=2), text, ablation_study.draw(study))
+        _write_report(self.out, text, ablation_study.draw(study))
         _say(self.out, text)
 
 
@@ -186,12 +188,12 @@ class FewDemonstrations:
         )
         counts = self.demonstrations or (25, 50, 100, 200)
 
-        def write(study: few_demonstrations.Study) -> None:
+        def write(study: few_demonstrations.Study) -> str:
+            text = few_demonstrations_report.markdown(study)
             # RL from scratch has no place of its own: it is a control of each base.
             if study.counts():
-                text = few_demonstrations_report.markdown(study)
-                figure = few_demonstrations_report.draw(study)
-                _write(self.out, study.model_dump_json(indent=2), text, figure)
+                _write_report(self.out, text, few_demonstrations_report.draw(study))
+            return text
 
         with console.meter() as update:
             study = few_demonstrations.run_study(
@@ -204,8 +206,7 @@ class FewDemonstrations:
                 processes=self.processes,
                 on_finished=write,
             )
-        write(study)
-        _say(self.out, few_demonstrations_report.markdown(study))
+        _say(self.out, write(study))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -247,13 +248,20 @@ class Attention:
         print(f"wrote {self.out}")
 
 
-def _write(out: Path, content: str, text: str, figure: Any) -> None:
-    """Write a study as JSON, Markdown and picture."""
+def _write_json(out: Path, study: Any) -> None:
+    """Write all that a study found, a pydantic model."""
     from hvs_suite.files import replacing
 
-    for name, written in (("study.json", content + "\n"), ("study.md", text)):
-        with replacing(out / name) as temporary:
-            temporary.write_text(written, encoding="utf-8")
+    with replacing(out / "study.json") as temporary:
+        temporary.write_text(study.model_dump_json(indent=2) + "\n", encoding="utf-8")
+
+
+def _write_report(out: Path, text: str, figure: Any) -> None:
+    """Write a study's tables and picture."""
+    from hvs_suite.files import replacing
+
+    with replacing(out / "study.md") as temporary:
+        temporary.write_text(text, encoding="utf-8")
     with replacing(out / "study.png") as temporary:
         figure.savefig(temporary)
 

@@ -320,10 +320,8 @@ class Run:
         if self._on_progress is None:
             return
         recent = [float(episode["r"]) for episode in self._model.ep_info_buffer or ()]
-        (share_then, steps_then, then), (share_now, steps_now, now) = (
-            self._recent[0],
-            self._recent[-1],
-        )
+        share_then, steps_then, then = self._recent[0]
+        share_now, steps_now, now = self._recent[-1]
         used = share_now - share_then
         self._on_progress(
             Progress(

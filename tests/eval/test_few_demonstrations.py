@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from hvs_suite.cli.main import run
 from hvs_suite.errors import OptionError, OutputError
 from hvs_suite.eval import few_demonstrations_report
 from hvs_suite.eval.few_demonstrations import (
@@ -122,6 +123,22 @@ def test_all_that_is_finished_is_reported(kept):
     assert "| 3 | 2 | 50.0 %" in text
     assert "| 4 | 1 | 50.0 %" in text
     assert len(few_demonstrations_report.draw(study).axes) == 2
+
+
+def test_a_study_that_is_finished_is_reported_at_once(kept, capsys):
+    words = ["study", "few-demonstrations", "--data", str(SAMPLE), "--out", str(kept)]
+    budget = [
+        word
+        for name, number in dataclasses.asdict(BUDGET).items()
+        for word in (f"--{name.replace('_', '-')}", str(number))
+    ]
+    before = (kept / "study.json").read_text()
+    assert run([*words, "--demonstrations", "3", "--seeds", "2", *budget]) == 0
+    assert (kept / "study.json").read_text() == before
+    text = (kept / "study.md").read_text()
+    assert "| 4 | 1 | 50.0 %" in text
+    assert capsys.readouterr().out.startswith(text)
+    assert (kept / "study.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_what_is_finished_is_reported_before_its_control_is():
