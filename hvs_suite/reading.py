@@ -1,0 +1,267 @@
+"""Reading what may come from a stranger: one bounded reader a format.
+
+Each refuses what is no regular file, is larger than its caller allows, or would unpack to more than
+that, before it is read; and each ends in the caller's own typed error, with one line. Nothing here
+loads pickles.
+"""
+
+import io
+import json
+import math
+import os
+import stat
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pydantic
+
+from hvs_suite.errors import HvsError
+
+MOST_JSON_BYTES = 64 * 2**20
+"""Larger than any JSON file of ours: a result of 1,000 scenarios takes 1 MB."""
+# Far deeper than any file of ours; Python's parser itself gives up at about a thousand.
+_MOST_JSON_DEPTH = 64
+_NPZ_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_ENCRYPTED = 0x1
+
+
+def check_regular(
+    path: Path, *, error: type[HvsError], within: Path | None = None, most: int | None = None
+) -> int:
+    """Check that a path names an ordinary file.
+
+    Args:
+        path: The file; symbolic links are followed.
+        error: Raised where it is not.
+        within: Folder that the file has to lie in once links and ``..`` are resolved.
+        most: Largest size allowed (bytes); None for any.
+
+    Returns:
+        Its size (bytes).
+
+    Raises:
+        HvsError: As `error`: it is missing, a folder, a FIFO, a device, outside, or too large.
+    """
+    try:
+        if within is not None and not path.resolve().is_relative_to(within.resolve()):
+            raise error(f"{path}: leads out of {within}; only files inside it are read")
+        found = path.stat()
+    except (OSError, ValueError, RuntimeError) as reason:
+        raise error(f"{path}: cannot be read ({_why(reason)})") from reason
+    if not stat.S_ISREG(found.st_mode):
+        kind = "a folder" if stat.S_ISDIR(found.st_mode) else "no regular file"
+        raise error(f"{path}: is {kind}; a file is expected")
+    if most is not None and found.st_size > most:
+        raise error(f"{path}: holds {found.st_size:,} bytes; at most {most:,} are read")
+    return found.st_size
+
+
+def read_bytes(
+    path: Path, *, most: int, error: type[HvsError], within: Path | None = None
+) -> bytes:
+    """Read an ordinary file of bounded size.
+
+    Args:
+        path: The file.
+        most: Largest size allowed (bytes).
+        error: Raised where it cannot be read.
+        within: As in `check_regular`.
+
+    Raises:
+        HvsError: As `error`.
+    """
+    check_regular(path, error=error, within=within, most=most)
+    try:
+        # A FIFO put there after the check would block for ever without O_NONBLOCK.
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        with os.fdopen(descriptor, "rb") as file:
+            content = file.read(most + 1)
+    except OSError as reason:
+        raise error(f"{path}: cannot be read ({_why(reason)})") from reason
+    if len(content) > most:
+        raise error(f"{path}: holds more than {most:,} bytes")
+    return content
+
+
+def parse_json(content: bytes, what: object, *, error: type[HvsError]) -> Any:
+    """Parse JSON of bounded depth, without NaN and infinity.
+
+    Args:
+        content: UTF-8 text.
+        what: Where it comes from, for the message.
+        error: Raised where it is not such JSON.
+
+    Raises:
+        HvsError: As `error`.
+    """
+    try:
+        parsed = json.loads(content, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as reason:
+        raise error(f"{what}: is not JSON ({_why(reason)})") from reason
+    if _depth_exceeds(parsed, _MOST_JSON_DEPTH):
+        raise error(f"{what}: is nested more than {_MOST_JSON_DEPTH} deep")
+    return parsed
+
+
+def read_json(
+    path: Path,
+    *,
+    error: type[HvsError],
+    within: Path | None = None,
+    most: int = MOST_JSON_BYTES,
+) -> Any:
+    """Read a JSON file; see `read_bytes` and `parse_json`."""
+    return parse_json(read_bytes(path, most=most, error=error, within=within), path, error=error)
+
+
+def read_object(
+    path: Path,
+    *,
+    error: type[HvsError],
+    within: Path | None = None,
+    most: int = MOST_JSON_BYTES,
+) -> dict[str, Any]:
+    """Read a JSON file that holds one object; see `read_json`."""
+    content = read_json(path, error=error, within=within, most=most)
+    if not isinstance(content, dict):
+        raise error(f"{path}: holds {type(content).__name__}, not an object")
+    return content
+
+
+def validated[Model: pydantic.BaseModel](
+    model: type[Model], content: Any, what: object, *, error: type[HvsError]
+) -> Model:
+    """Hold parsed JSON against a model.
+
+    Args:
+        model: What it should be.
+        content: Parsed JSON.
+        what: Where it comes from, for the message.
+        error: Raised with the first thing that is wrong.
+
+    Raises:
+        HvsError: As `error`.
+    """
+    try:
+        return model.model_validate(content)
+    except pydantic.ValidationError as reason:
+        first = reason.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        message = first["msg"].removeprefix("Value error, ")
+        raise error(f"{what}: {where + ': ' if where else ''}{message}") from reason
+
+
+def read_npz(
+    path: Path,
+    arrays: Mapping[str, tuple[npt.DTypeLike, int]],
+    *,
+    most: int,
+    error: type[HvsError],
+    within: Path | None = None,
+) -> dict[str, npt.NDArray[Any]]:
+    """Read named arrays of an ``npz`` file whose unpacked size is bounded.
+
+    Args:
+        path: The file.
+        arrays: Type and number of dimensions of each array that must be in it; others are refused.
+        most: Largest size allowed, packed and unpacked (bytes).
+        error: Raised where it is not such a file.
+        within: As in `check_regular`.
+
+    Raises:
+        HvsError: As `error`: not a zip, encrypted, of another compression, damaged, too large, or
+            with other arrays.
+    """
+    content = read_bytes(path, most=most, error=error, within=within)
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            members = {
+                member.filename.removesuffix(".npy"): member for member in archive.infolist()
+            }
+            if sorted(members) != sorted(arrays) or len(archive.infolist()) != len(arrays):
+                raise error(f"{path}: holds {_names(members)}, not {_names(arrays)}")
+            if sum(member.file_size for member in members.values()) > most:
+                raise error(f"{path}: would unpack to more than {most:,} bytes")
+            return {
+                name: _read_member(path, archive, members[name], dtype, ndim, error)
+                for name, (dtype, ndim) in arrays.items()
+            }
+    except (
+        OSError,
+        ValueError,
+        EOFError,
+        RuntimeError,
+        NotImplementedError,
+        zlib.error,
+        zipfile.BadZipFile,
+    ) as reason:
+        if isinstance(reason, HvsError):
+            raise
+        raise error(f"{path}: cannot be read ({_why(reason)})") from reason
+
+
+def _read_member(
+    path: Path,
+    archive: zipfile.ZipFile,
+    member: zipfile.ZipInfo,
+    dtype: npt.DTypeLike,
+    ndim: int,
+    error: type[HvsError],
+) -> npt.NDArray[Any]:
+    if member.flag_bits & _ENCRYPTED or member.compress_type not in _NPZ_METHODS:
+        raise error(f"{path}: {member.filename} is encrypted or of an unknown compression")
+    with archive.open(member) as file:
+        # Never more than the directory says, which the caller has bounded; the CRC is checked.
+        content = file.read(member.file_size + 1)
+    stream = io.BytesIO(content)
+    version = np.lib.format.read_magic(stream)
+    if version not in ((1, 0), (2, 0)):
+        raise error(f"{path}: {member.filename} has an unknown npy version")
+    read_header = (
+        np.lib.format.read_array_header_1_0
+        if version == (1, 0)
+        else np.lib.format.read_array_header_2_0
+    )
+    shape, fortran, found = read_header(stream)
+    if found != np.dtype(dtype) or len(shape) != ndim or fortran:
+        raise error(
+            f"{path}: {member.filename} holds {found} of shape {shape}, not {np.dtype(dtype)} "
+            f"with {ndim} dimensions"
+        )
+    values = content[stream.tell() :]
+    if min(shape, default=0) < 0 or math.prod(shape) * found.itemsize != len(values):
+        raise error(f"{path}: {member.filename} is not as long as its shape {shape} says")
+    return np.frombuffer(values, found).reshape(shape).copy()
+
+
+def _refuse_constant(name: str) -> Any:
+    raise ValueError(f"{name} is no number")
+
+
+def _depth_exceeds(value: Any, most: int) -> bool:
+    level = [value]
+    for _ in range(most):
+        level = [
+            item
+            for holder in level
+            if isinstance(holder, dict | list)
+            for item in (holder.values() if isinstance(holder, dict) else holder)
+        ]
+        if not level:
+            return False
+    return True
+
+
+def _names(names: Mapping[str, object]) -> str:
+    listed = sorted(names)
+    return ", ".join(listed[:6]) + (", ..." if len(listed) > 6 else "") or "nothing"
+
+
+def _why(reason: BaseException) -> str:
+    text = getattr(reason, "strerror", None) or str(reason) or type(reason).__name__
+    return str(text).splitlines()[0][:200]
