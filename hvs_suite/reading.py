@@ -219,7 +219,7 @@ def _read_member(
         # Never more than the directory says, which the caller has bounded; the CRC is checked.
         content = file.read(member.file_size + 1)
     stream = io.BytesIO(content)
-    version = np.lib.format.read_magic(stream)
+    version = np.lib.format.read_magic(stream)  # type: ignore[no-untyped-call]
     if version not in ((1, 0), (2, 0)):
         raise error(f"{path}: {member.filename} has an unknown npy version")
     read_header = (
@@ -227,7 +227,7 @@ def _read_member(
         if version == (1, 0)
         else np.lib.format.read_array_header_2_0
     )
-    shape, fortran, found = read_header(stream)
+    shape, fortran, found = read_header(stream)  # type: ignore[no-untyped-call]
     if found != np.dtype(dtype) or len(shape) != ndim or fortran:
         raise error(
             f"{path}: {member.filename} holds {found} of shape {shape}, not {np.dtype(dtype)} "
