@@ -15,8 +15,8 @@ from hvs_suite.datasets.features import SCENARIO, image_key
 from hvs_suite.datasets.metadata import DatasetMetadata, read_metadata
 from hvs_suite.files import replacing
 from hvs_suite.registry import find
-from hvs_suite.tasks.lock import digest
-from hvs_suite.tasks.variants import AlignVariant, with_options
+from hvs_suite.tasks.shared.lock import digest
+from hvs_suite.tasks.shared.spec import Spec
 
 CARD = "README.md"
 PICTURE = "pictures.png"
@@ -116,7 +116,7 @@ def describe(
         contents: What it holds.
         licence: Identifier of its licence.
     """
-    variant = with_options(find(metadata.task), metadata.options)
+    variant = find(metadata.task).with_options(metadata.options)
     share = 100.0 * contents.successes / max(1, contents.episodes)
     options = ", ".join(f"`{k}={v!r}`" for k, v in sorted(metadata.options.items())) or "as named"
     noise = (
@@ -129,7 +129,7 @@ def describe(
         "task": f"`{metadata.task}`, version {metadata.task_version}",
         "task digest": f"`{metadata.task_digest or digest(metadata.task)}`",
         "options": options,
-        "instruction": variant.instruction,
+        "instruction": variant.instruction(),
         "robot": f"KUKA LBR iiwa 7 R800, {JOINT_NAMES[0]} to {JOINT_NAMES[-1]}, simulated (MuJoCo)",
         "split and scenarios": f"`{metadata.split}`, {contents.scenarios[0]} to "
         f"{contents.scenarios[1]}",
@@ -233,7 +233,7 @@ def _images(info: dict[str, Any]) -> str:
     return "; ".join(kept) or "none"
 
 
-def _tolerance(variant: AlignVariant) -> str:
+def _tolerance(variant: Spec) -> str:
     """What counts as success, in a sentence."""
     if variant.position_tolerance_mm is not None:
         length = f"{variant.position_tolerance_mm:g} mm"

@@ -31,8 +31,8 @@ from hvs_suite.datasets.resimulation import resimulate
 from hvs_suite.errors import DatasetError, HvsError
 from hvs_suite.registry import find
 from hvs_suite.rollout import play
-from hvs_suite.tasks.lock import digest
-from hvs_suite.tasks.variants import AlignVariant, with_options
+from hvs_suite.tasks.shared.lock import digest
+from hvs_suite.tasks.shared.spec import Spec
 
 LEROBOT_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 # Their values are checked one by one; their statistics mean nothing, and LeRobot's own merge leaves
@@ -109,7 +109,7 @@ def check_dataset(
         raise DatasetError(f"{root} holds no dataset; name the root of one made by 'hvs record'")
     try:
         metadata = read_metadata(root)
-        variant = with_options(find(metadata.task), metadata.options)
+        variant = find(metadata.task).with_options(metadata.options)
         features = dataset_features(variant)
     except HvsError as error:
         return Report(0, 0, (Damage(METADATA_FILE, None, None, str(error)),))
@@ -215,7 +215,7 @@ class CheckEpisode:
         if self._can_be_played(place, columns, findings):
             differences = resimulate(
                 env,
-                with_options(find(self.metadata.task), self.metadata.options),
+                find(self.metadata.task).with_options(self.metadata.options),
                 columns,
                 self.features,
                 picture=(lambda key, frame: decoded[key].get(frame)) if self.pictures else None,
@@ -387,7 +387,7 @@ def _no_policy(env: Any) -> Any:
     return None
 
 
-def _check_same_task(root: Path, metadata: DatasetMetadata, variant: AlignVariant) -> None:
+def _check_same_task(root: Path, metadata: DatasetMetadata, variant: Spec) -> None:
     """Refuses a dataset of another meaning of the task: nothing could be reproduced.
 
     Raises:
@@ -408,7 +408,7 @@ def _check_same_task(root: Path, metadata: DatasetMetadata, variant: AlignVarian
 def _check_info(
     info: Mapping[str, Any],
     features: Mapping[str, Mapping[str, Any]],
-    variant: AlignVariant,
+    variant: Spec,
     places: Iterable[Place],
 ) -> list[Damage]:
     """Names, shapes, types and counts of ``meta/info.json``."""
@@ -440,13 +440,13 @@ def _check_info(
     return [Damage(reader.INFO, None, None, what) for what in wrong]
 
 
-def _check_sentence(root: Path, variant: AlignVariant) -> list[Damage]:
+def _check_sentence(root: Path, variant: Spec) -> list[Damage]:
     try:
         sentences = reader.read_sentences(root)
     except DatasetError as error:
         what = str(error).removeprefix(f"{reader.TASKS} ")
         return [Damage(reader.TASKS, None, None, what)]
-    if sentences != [variant.instruction]:
+    if sentences != [variant.instruction()]:
         return [Damage(reader.TASKS, None, None, f"{sentences} is not the task's sentence")]
     return []
 
@@ -505,7 +505,7 @@ def _check_files(root: Path, places: Iterable[Place]) -> tuple[set[str], list[Da
 def _columns_of(root: Path) -> list[str]:
     """Columns that every data file must have."""
     metadata = read_metadata(root)
-    features = dataset_features(with_options(find(metadata.task), metadata.options))
+    features = dataset_features(find(metadata.task).with_options(metadata.options))
     return [*features, *LEROBOT_COLUMNS]
 
 

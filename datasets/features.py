@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.errors import OptionError
-from hvs_suite.tasks.variants import AlignVariant, observation_names
+from hvs_suite.tasks.shared.spec import Spec, observation_names
 
 ROBOT_TYPE = "kuka_lbr_iiwa"
 # Spelled out rather than imported: robot.py loads MuJoCo, and reading a dataset must not.
@@ -49,7 +49,7 @@ def image_key(camera: str) -> str:
     return f"observation.images.{camera}"
 
 
-def dataset_features(variant: AlignVariant) -> dict[str, dict[str, Any]]:
+def dataset_features(variant: Spec) -> dict[str, dict[str, Any]]:
     """The features of a dataset of this task, in LeRobot's form.
 
     Raises:
@@ -95,7 +95,7 @@ def dataset_features(variant: AlignVariant) -> dict[str, dict[str, Any]]:
 
 
 def observed_part(
-    variant: AlignVariant, observation: Mapping[str, npt.NDArray[Any]], environment: Any
+    variant: Spec, observation: Mapping[str, npt.NDArray[Any]], environment: Any
 ) -> Frame:
     """The columns that are known before the action: observation and privileged values.
 
@@ -141,7 +141,7 @@ def acted_part(
     }
 
 
-def _state_names(variant: AlignVariant) -> list[str]:
+def _state_names(variant: Spec) -> list[str]:
     """The joint observations of a task, positions first."""
     names = observation_names(variant.observations)
     return [name for name in _STATE_SUFFIX if name in names]

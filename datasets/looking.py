@@ -27,7 +27,7 @@ import numpy.typing as npt
 
 from hvs_suite.cell.robot import JOINT_SPEED_RAD_S
 from hvs_suite.datasets.expert import CLEARANCE_M, Expert
-from hvs_suite.tasks.variants import TASKS
+from hvs_suite.registry import TASKS
 
 if TYPE_CHECKING:
     from hvs_suite.cell.environment import Environment

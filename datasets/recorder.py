@@ -24,8 +24,7 @@ from hvs_suite.datasets.metadata import (
 from hvs_suite.errors import DatasetError, HvsError, OptionError, OutputError, ScenarioError
 from hvs_suite.registry import find
 from hvs_suite.rollout import play
-from hvs_suite.tasks.lock import digest
-from hvs_suite.tasks.variants import with_options
+from hvs_suite.tasks.shared.lock import digest
 
 BLOCK_EPISODES = 50
 """Episodes between two publications: what a kill can cost."""
@@ -95,7 +94,7 @@ def record(
             records into it.
         DatasetError: What ``resume`` found was recorded otherwise.
     """
-    variant = with_options(find(task), dict(options or {}))
+    variant = find(task).with_options(dict(options or {}))
     features = dataset_features(variant)
     _check_numbers(episodes, split, noise, workers, block)
     root = Path(out)
@@ -120,7 +119,7 @@ def record(
         outcomes = published_outcomes(root)
         tracker = _Tracker(len(outcomes), sum(outcomes), episodes, progress)
         fps = round(1.0 / variant.control_period_s)
-        writer = DatasetWriter(root, features, fps, variant.instruction, block)
+        writer = DatasetWriter(root, features, fps, variant.instruction(), block)
         played = play(
             MakeEnvironment(task, split, dict(options or {})),
             make_demonstrator,

@@ -29,7 +29,7 @@ from hvs_suite.pictures import FAINT, GREEN, INK, PAPER, RED, TRACK, Picture, as
 from hvs_suite.registry import load
 
 if TYPE_CHECKING:
-    from hvs_suite.tasks.variants import AlignVariant
+    from hvs_suite.tasks.shared.spec import Spec
 
 # Layout (px): a line of text, the cell with the cameras stacked beside it, the curves below.
 MARGIN = 16
@@ -144,7 +144,7 @@ def _noise_in_words(metadata: DatasetMetadata) -> str:
 
 
 def _frame(
-    variant: "AlignVariant",
+    variant: "Spec",
     cell: Picture,
     pictures: Mapping[str, Picture],
     curves: Picture,
@@ -183,7 +183,7 @@ def _frame(
     return np.asarray(frame)
 
 
-def _curves(variant: "AlignVariant", errors: npt.NDArray[Any], step: int) -> Picture:
+def _curves(variant: "Spec", errors: npt.NDArray[Any], step: int) -> Picture:
     """Position and tilt error over the steps, bold up to now, with the tolerances.
 
     Args:

@@ -27,7 +27,7 @@ from hvs_suite.datasets.features import (
 
 if TYPE_CHECKING:
     from hvs_suite.cell.environment import Environment
-    from hvs_suite.tasks.variants import AlignVariant
+    from hvs_suite.tasks.shared.spec import Spec
 
 # Positions in rad and m, images in px, errors in mm and deg: far below every tolerance of a task,
 # far above what another build of the libraries rounds in float32.
@@ -62,7 +62,7 @@ class Difference:
 
 def resimulate(
     env: "Environment",
-    variant: "AlignVariant",
+    variant: "Spec",
     columns: Mapping[str, npt.NDArray[Any]],
     features: Mapping[str, Mapping[str, Any]],
     *,

@@ -7,7 +7,7 @@ from hvs_suite import registry, statistics
 from hvs_suite.eval.board_replays import Replay
 from hvs_suite.eval.result_file import Result, SettledErrorSummary
 from hvs_suite.eval.submission import Submission
-from hvs_suite.tasks.variants import TASKS
+from hvs_suite.registry import TASKS
 
 NOTE = (
     "Success is the share of scenarios solved, with its Wilson 95 % interval. Steps to goal are "

@@ -9,7 +9,7 @@ import pydantic
 
 from hvs_suite import statistics
 from hvs_suite.datasets.reader import Picture
-from hvs_suite.tasks.detection import find_disc
+from hvs_suite.tasks.shared.detection import find_disc
 
 FloatArray = npt.NDArray[np.float64]
 

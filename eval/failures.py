@@ -23,7 +23,7 @@ from hvs_suite.eval import action_log, result_file
 from hvs_suite.eval.result_file import EpisodeRow
 from hvs_suite.policies.checkpoint import load_network, network_inputs, read_config
 from hvs_suite.rollout import Action, Observation, one_torch_thread
-from hvs_suite.tasks.variants import AlignVariant
+from hvs_suite.tasks.shared.spec import Spec
 
 if TYPE_CHECKING:
     from hvs_suite.cell.environment import Environment
@@ -192,7 +192,7 @@ def _sort(
 
 def cause_of(
     row: EpisodeRow,
-    variant: AlignVariant,
+    variant: Spec,
     seen_steps: int,
     estimate_error_mm: float | None,
     errors_mm: Sequence[float],

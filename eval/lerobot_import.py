@@ -14,7 +14,7 @@ import pydantic
 
 from hvs_suite import files, registry, statistics
 from hvs_suite.errors import ResultError
-from hvs_suite.tasks.scenario import TEST_SCENARIOS, TEST_SPLIT
+from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
 
 LEROBOT_SEED = 1000
 """``lerobot-eval`` counts its seeds up from here unless told otherwise (``--seed``)."""

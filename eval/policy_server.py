@@ -21,9 +21,9 @@ from websockets.sync.server import Server, ServerConnection, serve
 from hvs_suite.errors import HvsError, OptionError, PolicyError, ServerError
 from hvs_suite.eval import protocol, wire
 from hvs_suite.policies.context import PolicyContext
+from hvs_suite.registry import TASKS
 from hvs_suite.rollout import Policy, library_seeds, one_torch_thread
-from hvs_suite.tasks import lock
-from hvs_suite.tasks.variants import TASKS
+from hvs_suite.tasks.shared import lock
 
 # How often a server that waits for its policy looks whether anybody still wants the answer.
 _LOOK_PERIOD_S = 0.2

@@ -16,8 +16,8 @@ from hvs_suite.eval.trial import PlayTrial, Trial
 from hvs_suite.policies.catalogue import policy_factory
 from hvs_suite.policies.context import Blindfolded
 from hvs_suite.policies.imported import ImportedFactory
-from hvs_suite.tasks import lock
-from hvs_suite.tasks.scenario import TEST_SCENARIOS, TEST_SPLIT
+from hvs_suite.tasks.shared import lock
+from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
 
 DECISION_LIMIT_S = 10.0
 """A hundred control periods: far above any policy that could be used, below a hung one."""

@@ -31,7 +31,7 @@ from hvs_suite.eval.trial import (
     episode_seed,
 )
 from hvs_suite.rollout import Action, Observation
-from hvs_suite.tasks import lock
+from hvs_suite.tasks.shared import lock
 
 CONNECT_LIMIT_S = 10.0
 WELCOME_LIMIT_S = 120.0
@@ -243,7 +243,7 @@ def hello(task: str, env: Any) -> wire.Message:
         "task": task,
         "task_version": variant.version,
         "task_digest": lock.digest(task),
-        "instruction": variant.instruction,
+        "instruction": variant.instruction(),
         "period_s": variant.control_period_s,
         "parameters": dataclasses.asdict(variant),
         "observations": {name: _describe(spec) for name, spec in env.observation_spec().items()},

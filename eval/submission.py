@@ -8,7 +8,7 @@ from hvs_suite.errors import ResultError
 from hvs_suite.eval import result_file
 from hvs_suite.eval.result_file import Result
 from hvs_suite.eval.verification import check_task
-from hvs_suite.tasks.scenario import TEST_SCENARIOS, TEST_SPLIT
+from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
 
 # Its ten places come round again after ten scenarios.
 EPISODES: Mapping[str, int] = {"align-fixed": 10}

@@ -29,7 +29,7 @@ from hvs_suite.eval.trial import (
 )
 from hvs_suite.policies import builtin
 from hvs_suite.rollout import Action, Observation
-from hvs_suite.tasks import lock
+from hvs_suite.tasks.shared import lock
 
 LOG_ENDS = "the action log ends"
 _OUTCOME = (

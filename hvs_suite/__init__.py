@@ -10,8 +10,7 @@ as ``hvs_suite/<name>-v<version>``.
 """
 
 from hvs_suite.gym import register
-from hvs_suite.registry import load
-from hvs_suite.tasks.variants import TASKS
+from hvs_suite.registry import TASKS, load
 
 __version__ = "0.1.0"
 __all__ = ["TASKS", "load"]

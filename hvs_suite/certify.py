@@ -17,8 +17,8 @@ import hvs_suite
 from hvs_suite.datasets.expert import make_expert
 from hvs_suite.files import replacing
 from hvs_suite.rollout import rollout
-from hvs_suite.tasks import certificate, lock
-from hvs_suite.tasks.scenario import TEST_SCENARIOS, TEST_SPLIT
+from hvs_suite.tasks.shared import certificate, lock
+from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
 
 TASKS_FOLDER = Path(lock.__file__).resolve().parent
 

@@ -19,8 +19,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from hvs_suite.errors import OptionError
-from hvs_suite.registry import load
-from hvs_suite.tasks.variants import TASKS
+from hvs_suite.registry import TASKS, load
 
 if TYPE_CHECKING:
     import dm_env
@@ -76,7 +75,7 @@ class AlignEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
         variant = self._environment.variant
         self.metadata = {**self.metadata, "render_fps": round(1.0 / variant.control_period_s)}
         self.task = variant.name
-        self.task_description = variant.instruction
+        self.task_description = variant.instruction()
         specification = self._environment.observation_spec()
         self._spaces: dict[str, spaces.Space[Any]] = {
             name: _space(spec) for name, spec in specification.items()

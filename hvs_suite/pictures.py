@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from hvs_suite.cell.environment import Environment
     from hvs_suite.rollout import Action, Episode, Observation, Policy
-    from hvs_suite.tasks.variants import AlignVariant
+    from hvs_suite.tasks.shared.spec import Spec
 
 Picture = npt.NDArray[np.uint8]
 
@@ -263,7 +263,7 @@ def _draw_joints(draw: "ImageDraw", joints: npt.NDArray[np.float64], top: int) -
 
 def _draw_standing(
     draw: "ImageDraw",
-    variant: "AlignVariant",
+    variant: "Spec",
     info: Mapping[str, Any],
     top: int,
     reward_terms: Mapping[str, float],

@@ -1,16 +1,45 @@
-"""The registry: from a task's name to a ready environment."""
+"""The registry: from a task's name to a ready environment.
+
+The suite's own families are imported here, the only place above ``tasks`` that names them; those of
+other packages are found by their entry points (see `hvs_suite.tasks.shared.family`).
+"""
 
 import difflib
+import functools
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
+import hvs_suite.tasks.align  # noqa: F401 - registers its tasks
 from hvs_suite.errors import OptionError, UnknownTaskError
-from hvs_suite.tasks.variants import TASKS, AlignVariant, with_options
+from hvs_suite.tasks.shared import family
+from hvs_suite.tasks.shared.spec import Spec
 
 if TYPE_CHECKING:
     from hvs_suite.cell.environment import Environment
+    from hvs_suite.tasks.shared.arm_task import ArmTask
 
 
-def find(name: str) -> AlignVariant:
+class _Tasks(Mapping[str, Spec]):
+    """What each registered name stands for; a view that grows when a family is registered."""
+
+    def __getitem__(self, name: str) -> Spec:
+        return _all()[name].spec
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_all())
+
+    def __len__(self) -> int:
+        return len(_all())
+
+    def __repr__(self) -> str:
+        return f"TASKS({', '.join(self)})"
+
+
+TASKS: Mapping[str, Spec] = _Tasks()
+"""The named tasks, family by family, the easiest of each first."""
+
+
+def find(name: str) -> Spec:
     """Parameters of a named task.
 
     Args:
@@ -26,6 +55,36 @@ def find(name: str) -> AlignVariant:
     raise UnknownTaskError(f"unknown task {name!r}; {hint}")
 
 
+def family_of(name: str) -> type[family.Family[Any, Any]]:
+    """The class that plays a named task.
+
+    Args:
+        name: Registered name.
+
+    Raises:
+        UnknownTaskError: There is no such task.
+    """
+    find(name)
+    return _all()[name].family
+
+
+def make_task(spec: Spec, split: str) -> "ArmTask":
+    """The task behind an environment.
+
+    Args:
+        spec: Parameters, of a named task or changed from one.
+        split: Name of the stream of scenarios.
+
+    Raises:
+        UnknownTaskError: The spec's name is not registered.
+        OptionError: The spec asks for what cannot be.
+        ScenarioError: The split's name is empty.
+    """
+    from hvs_suite.tasks.shared.arm_task import ArmTask
+
+    return ArmTask(family_of(spec.name)(spec, find(spec.name)), split)
+
+
 def load(
     name: str, *, split: str = "train", seed: int | None = None, **options: Any
 ) -> "Environment":
@@ -35,7 +94,7 @@ def load(
         name: Registered name, one of ``hvs_suite.TASKS``.
         split: Stream of scenarios: ``test`` holds 1,000 frozen ones, any other name is unbounded.
         seed: Start of the stream that bare ``reset()`` calls walk, from 0 up; None draws one.
-        **options: Any field of ``AlignVariant``, for studies; a named task fixes all of them.
+        **options: Any field of the task's spec, for studies; a named task fixes all of them.
 
     Returns:
         The environment; play scenario i with ``reset(scenario=i)``.
@@ -45,11 +104,20 @@ def load(
         OptionError: An option does not exist or its value makes no sense.
         ScenarioError: The split's name is empty.
     """
-    variant = with_options(find(name), options)
+    spec = find(name).with_options(options)
     if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or seed < 0):
         raise OptionError(f"seed is {seed!r}; use a whole number from 0 up, or None")
     # MuJoCo takes half a second to import: listing tasks must not pay for it.
     from hvs_suite.cell.environment import Environment
-    from hvs_suite.tasks.align import Align
 
-    return Environment(Align(variant, split), seed=seed)
+    return Environment(make_task(spec, split), seed=seed)
+
+
+def _all() -> Mapping[str, family.Registered]:
+    _discover()
+    return family.registered()
+
+
+@functools.cache
+def _discover() -> None:
+    family.discover()

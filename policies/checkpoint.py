@@ -27,7 +27,7 @@ from hvs_suite.policies.hvs.network import (
     shape_from_config,
 )
 from hvs_suite.rollout import Observation, one_torch_thread
-from hvs_suite.tasks.variants import AlignVariant, observation_names
+from hvs_suite.tasks.shared.spec import Spec, observation_names
 
 Action = npt.NDArray[np.float32]
 Decide = Callable[[dict[str, Tensor]], Tensor]
@@ -49,7 +49,7 @@ class Stage(Protocol):
     """What a checkpoint needs of an environment."""
 
     @property
-    def variant(self) -> AlignVariant:
+    def variant(self) -> Spec:
         """Parameters of the task."""
 
 
@@ -83,7 +83,7 @@ class CheckpointPolicy:
         PolicyError: The checkpoint cannot be loaded, or does not fit the task.
     """
 
-    def __init__(self, folder: Path, variant: AlignVariant) -> None:
+    def __init__(self, folder: Path, variant: Spec) -> None:
         config = read_config(folder)
         check_fit(config, folder, variant)
         self._inputs = tuple(config["input_features"])
@@ -91,7 +91,7 @@ class CheckpointPolicy:
             if config.get("type") == "hvs" and _processors_are_standard(folder):
                 self._decide, self._forget = _network(folder, config)
             else:
-                self._decide, self._forget = _lerobot(folder, variant.instruction)
+                self._decide, self._forget = _lerobot(folder, variant.instruction())
 
     def reset(self) -> None:
         """Forget the last episode."""
@@ -182,7 +182,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     return config
 
 
-def check_fit(config: Mapping[str, Any], folder: Path, variant: AlignVariant) -> None:
+def check_fit(config: Mapping[str, Any], folder: Path, variant: Spec) -> None:
     """Check that a task shows what a checkpoint reads, in the same size, and takes its actions.
 
     Args:

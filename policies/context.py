@@ -9,7 +9,7 @@ import dataclasses
 from typing import Any, Self
 
 from hvs_suite.rollout import Policy, PolicyFactory
-from hvs_suite.tasks.variants import AlignVariant
+from hvs_suite.tasks.shared.spec import Spec
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,7 +23,7 @@ class PolicyContext:
         period_s: Control period (s).
     """
 
-    variant: AlignVariant
+    variant: Spec
     observations: dict[str, Any]
     action: Any
     period_s: float

@@ -343,7 +343,7 @@ def _calibrate(
 
 
 def _standoff(manifest: Manifest) -> float:
-    from hvs_suite.tasks.variants import TASKS
+    from hvs_suite.registry import TASKS
 
     if manifest.task not in TASKS:
         raise DatasetError(f"{manifest.root} was recorded on {manifest.task}, an unknown task")

@@ -14,7 +14,6 @@ from hvs_suite.policies.checkpoint import load_network, read_config
 from hvs_suite.policies.demonstrations import Manifest, calibration_of
 from hvs_suite.policies.hvs.network import IMAGE_PREFIX, STATE, Eye
 from hvs_suite.registry import find
-from hvs_suite.tasks.variants import with_options
 
 if TYPE_CHECKING:
     from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
@@ -87,7 +86,7 @@ def tightest_scale(manifest: Manifest) -> float:
     Args:
         manifest: Of the dataset.
     """
-    task = with_options(find(manifest.task), manifest.options)
+    task = find(manifest.task).with_options(manifest.options)
     return 5e-3 * task.tightest_tolerance_mm
 
 
@@ -97,7 +96,7 @@ def trails_its_set_point(manifest: Manifest) -> bool:
     Args:
         manifest: Of the dataset.
     """
-    task = with_options(find(manifest.task), manifest.options)
+    task = find(manifest.task).with_options(manifest.options)
     return task.latency_steps > 0 and ACTION_EXECUTED in manifest.features
 
 

@@ -42,8 +42,8 @@ from hvs_suite.errors import PolicyError
 from hvs_suite.policies.target_estimate import Sight, Sighting, TargetEstimate
 from hvs_suite.policies.target_search import SPACING_M, TargetSearch
 from hvs_suite.rollout import Observation
-from hvs_suite.tasks.detection import find_discs
-from hvs_suite.tasks.variants import AlignVariant, observation_names
+from hvs_suite.tasks.shared.detection import find_discs
+from hvs_suite.tasks.shared.spec import Spec, observation_names
 
 if TYPE_CHECKING:
     from hvs_suite.cell.environment import Environment
@@ -74,7 +74,7 @@ class Playground(Protocol):
     """What the policy takes of an environment: the task's parameters, nothing else."""
 
     @property
-    def variant(self) -> AlignVariant:
+    def variant(self) -> Spec:
         """The task's parameters."""
 
 
@@ -92,7 +92,7 @@ class Belief:
         descent: Where the flange goes next from the goal, (3,) m, where it only hovers there.
     """
 
-    def __init__(self, variant: AlignVariant) -> None:
+    def __init__(self, variant: Spec) -> None:
         self.variant = variant
         self.joint_positions: FloatArray = np.zeros(7)
         self.joint_velocities: FloatArray = np.zeros(7)
@@ -202,7 +202,7 @@ class Servo:
         PolicyError: The task needs what this method does not do.
     """
 
-    def __init__(self, variant: AlignVariant) -> None:
+    def __init__(self, variant: Spec) -> None:
         _check(variant)
         self._variant = variant
         self._kinematics = kinematics()
@@ -367,14 +367,14 @@ def _within_reach(goal: FloatArray) -> FloatArray:
     return np.array([goal[0] * scale, goal[1] * scale, goal[2]])
 
 
-def _calibration_sigma(variant: AlignVariant) -> float:
+def _calibration_sigma(variant: Spec) -> float:
     """What the published accuracy of the eye-to-hand calibration means on the surface (m)."""
     distance = float(np.linalg.norm(np.subtract(variant.eth_position_m, variant.eth_look_at_m)))
     turn = np.radians(variant.eth_rotation_noise_deg)
     return float(np.hypot(variant.eth_position_noise_m, distance * turn))
 
 
-def _check(variant: AlignVariant) -> None:
+def _check(variant: Spec) -> None:
     """Refuse what the method does not do, in a sentence."""
     names = observation_names(variant.observations)
     if not {"eih", "eth"} & set(names) or not {"joint_positions", "joint_velocities"} <= set(names):

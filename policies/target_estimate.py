@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from hvs_suite.cell.cameras import project
 from hvs_suite.cell.marker import HALF_THICKNESS_M
-from hvs_suite.tasks.detection import Disc
+from hvs_suite.tasks.shared.detection import Disc
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -1,483 +1,229 @@
 """``align``: hold the flange over a target, facing it, at a set distance, within tolerance.
 
-The thesis task with its defects removed, and the scene and scoring of all six named variants.
+The thesis's task with its defects removed. The target is one marker on the work surface, which is
+level in the named tasks and tilted or curved in studies. The arm may go on past its goal, so that
+one can see where a policy settles.
 """
 
+import dataclasses
+import functools
 import math
-from typing import Any
+from typing import TYPE_CHECKING, ClassVar, Literal
 
-import mujoco
 import numpy as np
 import numpy.typing as npt
-from dm_control import composer, mjcf
-from dm_env import specs
 
-from hvs_suite.cell import cameras
-from hvs_suite.cell.arena import Cell
-from hvs_suite.cell.environment import ServoTask
-from hvs_suite.cell.kinematics import kinematics, tool_frame
-from hvs_suite.cell.marker import HALF_THICKNESS_M
-from hvs_suite.cell.robot import (
-    JOINT_ACCELERATION_RAD_S2,
-    JOINT_RANGE_RAD,
-    JOINT_SPEED_RAD_S,
-    SHELL_GROUP,
-)
 from hvs_suite.errors import OptionError
-from hvs_suite.tasks import actions, appearance, observations, rewards
-from hvs_suite.tasks.scenario import Scenario, ScenarioSource
-from hvs_suite.tasks.variants import AlignVariant
+from hvs_suite.tasks.shared.family import register
+from hvs_suite.tasks.shared.goal import Goal
+from hvs_suite.tasks.shared.placing import Placing, PlacingSpec, is_reachable
+from hvs_suite.tasks.shared.scenario import Scenario, Streams, draw_look
+from hvs_suite.tasks.shared.spec import scene
+
+if TYPE_CHECKING:
+    from dm_control import mjcf
+
+    from hvs_suite.cell.arena import Cell
+    from hvs_suite.cell.surface import Surface
 
 FloatArray = npt.NDArray[np.float64]
 
-# A ray that ends this close to the target's centre met the target, not something before it.
-_RAY_SLACK_M = 0.003
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class AlignSpec(PlacingSpec):
+    """Every parameter of ``align``: place the flange over a marker, facing it, at a set distance.
+
+    Attributes:
+        goal: ``random`` on the ring, uniform in area; ``fixed``, one place drawn once per split;
+            ``places``, the ten places of ``align-fixed``, by index; or ``(x, y)`` (m, base frame).
+        surface: Shape of the work surface.
+        surface_size_m: Side lengths of the surface (m).
+    """
+
+    family: ClassVar[str] = "align"
+
+    goal: Literal["random", "fixed", "places"] | tuple[float, float] = scene("random")
+    surface: Literal["flat", "tilted", "curved"] = scene("flat")
+    surface_size_m: tuple[float, float] = (2.0, 2.0)
+
+    def __post_init__(self) -> None:
+        """Refuse values that make no sense, with a sentence.
+
+        Raises:
+            OptionError: One of them does not.
+        """
+        super().__post_init__()
+        if not min(self.surface_size_m) > 0:
+            raise OptionError(f"surface_size_m is {self.surface_size_m}; both sides are positive")
+        if isinstance(self.goal, tuple) and not math.hypot(*self.goal) > 0.1:
+            raise OptionError(
+                f"goal {self.goal} lies under the robot's base; move it at least 0.1 m away"
+            )
 
 
-class Align(ServoTask):
-    """The task; one object plays any scenario of its split.
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class AlignScenario(Scenario):
+    """One scene.
 
-    Args:
-        variant: All parameters.
-        split: Name of the stream of scenarios.
+    Attributes:
+        target: Centre of the target on the surface, (3,) m, base frame.
+        normal: Outward surface normal there, (3,).
+    """
+
+    target: FloatArray
+    normal: FloatArray
+
+
+class Align(Placing[AlignSpec, AlignScenario]):
+    """One still target.
 
     Raises:
-        OptionError: The control period is no multiple of the physics timestep, or a goal that was
-            asked for is out of reach.
-        ScenarioError: The split's name is empty.
+        OptionError: A goal that was asked for is out of reach.
     """
 
-    def __init__(self, variant: AlignVariant, split: str = "train") -> None:
-        self.variant = variant
-        self._cell = Cell(
-            surface=variant.surface,
-            surface_size_m=variant.surface_size_m,
-            marker=variant.marker,
-            target_diameter_m=variant.target_diameter_m,
-            eih_fov_deg=variant.eih_fov_deg,
-            eth_fov_deg=variant.eth_fov_deg,
-            eth_position_m=variant.eth_position_m,
-            eth_look_at_m=variant.eth_look_at_m,
-        )
-        self.source = ScenarioSource(variant, split, self._cell.surface)
-        self.time_limit_steps = variant.time_limit_steps
-        self.camera_side = max(variant.eih_resolution, variant.eth_resolution)
-        self.multisampling = variant.multisampling
-        timestep = float(self._cell.mjcf_model.option.timestep)
-        substeps = variant.control_period_s / timestep
-        if round(substeps) < 1 or abs(substeps - round(substeps)) > 1e-6:
+    def surface(self) -> "Surface":
+        """The surface that was asked for."""
+        from hvs_suite.cell.surface import Surface
+
+        self._surface = Surface(shape=self.spec.surface, size_m=self.spec.surface_size_m)
+        return self._surface
+
+    def build(self, cell: "Cell") -> None:
+        """Lay the marker; check what was asked for against the surface's shape."""
+        super().build(cell)
+        goal = self.spec.goal
+        if isinstance(goal, tuple) and not is_reachable(self.goal_over(*goal)):
             raise OptionError(
-                f"control_period_s is {variant.control_period_s}; use a whole multiple of the "
-                f"physics timestep of 1/{1.0 / timestep:.0f} s"
+                f"goal {goal} is out of the arm's reach, {self.spec.standoff_m} m off the "
+                "surface; choose a radius from 0.40 to 0.78 m"
             )
-        self.set_timesteps(control_timestep=variant.control_period_s, physics_timestep=timestep)
-        self._observables = observations.make_observables(self)
-        self._tolerances = variant.tolerances
-        self._scenario: Scenario | None = None
-        self._goal_configurations: FloatArray | None = None
-        self._errors: dict[str, float] = {}
-        self._reward_terms: dict[str, float] = {}
-        self._n_inside = 0
-        self._inside_once = False
-        self._clear_outcome()
+        if goal == "random" and self.spec.surface == "flat":
+            self.check_ring()
 
-    # --- composer -------------------------------------------------------------------------------
+    def goal_over(self, x: float, y: float) -> Goal:
+        """The goal over a point of the base plane (m)."""
+        target = np.array([x, y, self._surface.height(x, y)])
+        return Goal(target, self._surface.normal(x, y), self.spec.standoff_m)
 
-    @property
-    def root_entity(self) -> composer.Entity:
-        """The cell."""
-        return self._cell
+    def draw(self, streams: Streams) -> AlignScenario:
+        """Draw target, start and look."""
+        from hvs_suite.tasks.shared.start import draw_start
 
-    @property
-    def observables(self) -> dict[str, Any]:
-        """Observables by name: exactly the variant's observations, all enabled."""
-        return self._observables
-
-    def after_compile(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
-        """Look up indices in the compiled model once."""
-        del random_state
-        cell, variant = self._cell, self.variant
-        robot = cell.robot
-        joints = physics.bind(robot.joints)
-        self._qpos = np.array(joints.qposadr, int).ravel()
-        self._qvel = np.array(joints.dofadr, int).ravel()
-        self._actuators = np.array(physics.bind(robot.actuators).element_id, int).ravel()
-        self._act = physics.model.actuator_actadr[self._actuators].copy()
-        self._flange = int(physics.bind(robot.flange).element_id)
-        self._flange_body = int(physics.bind(robot.flange_body).element_id)
-        self.marker_geom = int(physics.bind(cell.marker.geom).element_id)
-        self._mocap = int(physics.model.body_mocapid[physics.model.geom_bodyid[self.marker_geom]])
-        self.cameras = {
-            "eih": cameras.Camera(
-                "eih",
-                int(physics.bind(cell.eih).element_id),
-                variant.eih_resolution,
-                variant.eih_channels,
-                variant.eih_fov_deg,
-            ),
-            "eth": cameras.Camera(
-                "eth",
-                int(physics.bind(cell.eth).element_id),
-                variant.eth_resolution,
-                variant.eth_channels,
-                variant.eth_fov_deg,
-            ),
-        }
-        self._appearance = appearance.Appearance(physics, cell)
-        self._rays = np.zeros(mujoco.mjNGROUP, np.uint8)
-        self._rays[: SHELL_GROUP + 1] = 1
-
-    def prepare(self, index: int) -> None:
-        """Draw scenario ``index``."""
-        self._scenario = self.source.draw(index)
-
-    def seeded_index(self, seed: int, count: int) -> int:
-        """As in ``ScenarioSource.seeded_index``."""
-        return self.source.seeded_index(seed, count)
-
-    def initialize_episode(
-        self, physics: mjcf.Physics, random_state: np.random.RandomState
-    ) -> None:
-        """Set the state and the look of the drawn scenario; nothing of earlier ones remains."""
-        del random_state
-        scenario = self.scenario
-        data = physics.data.ptr
-        data.qpos[self._qpos] = scenario.start
-        # The set point starts where the arm is: MuJoCo's default of 0 would throw it.
-        data.act[self._act] = scenario.start
-        data.mocap_pos[self._mocap] = scenario.target
-        data.mocap_quat[self._mocap] = _marker_orientation(scenario.normal)
-        self._appearance.apply(physics, scenario)
-        self.goal = scenario.target + scenario.normal * self.variant.standoff_m
-        self._normal = tuple(scenario.normal.tolist())
-        start = scenario.start + scenario.joint_offset
-        self._queue = [start.copy() for _ in range(self.variant.latency_steps)]
-        self._commanded = start
-        self._speed = np.zeros(len(start))
-        self._clear_outcome()
-        self._goal_configurations = None
-        if "joint_space" in self.variant.rewards:
-            self._goal_configurations = kinematics().goal_configurations(self.goal, scenario.normal)
-        mujoco.mj_kinematics(physics.model.ptr, data)
-        self._measure(physics)
-
-    def before_step(
-        self, physics: mjcf.Physics, action: Any, random_state: np.random.RandomState
-    ) -> None:
-        """Turn the action into the speed of the set point for this control step."""
-        del random_state
-        variant = self.variant
-        values, clipped = actions.check_action(
-            action, variant.action_mode, clip=self.environment.clip_actions
-        )
-        self._n_clipped += clipped
-        self._commanded = actions.set_point(
-            values, variant.action_mode, self._commanded, variant.control_period_s
-        )
-        self._queue.append(self._commanded)
-        data = physics.data.ptr
-        true_target = self._queue.pop(0) - self.scenario.joint_offset
-        distance = true_target - data.act[self._act]
-        speed = distance / variant.control_period_s
-        if variant.acceleration_limits:
-            speed = _accelerate(self._speed, distance, variant.control_period_s)
-        self._speed = np.minimum(np.maximum(speed, -JOINT_SPEED_RAD_S), JOINT_SPEED_RAD_S)
-        data.ctrl[self._actuators] = self._speed
-
-    def is_forbidden(self, physics: mjcf.Physics) -> bool:
-        """The flange never touches anything in this task: every contact is forbidden."""
-        return bool(physics.data.ptr.ncon)
-
-    def finish_step(self, physics: mjcf.Physics, *, collided: bool, at_time_limit: bool) -> None:
-        """Measure errors, count the hold, decide success, collision and truncation."""
-        self._measure(physics)
-        inside = self.is_inside and not collided
-        self._n_inside = self._n_inside + 1 if inside else 0
-        self._inside_once = self._inside_once or inside
-        self._collision = collided
-        self._success = self._n_inside >= self.variant.hold_steps
-        self._truncated = at_time_limit and not self._is_final
-
-        self._reward_terms = rewards.reward_terms(
-            self.variant,
-            rewards.StepOutcome(
-                success=self._success,
-                collision=self._collision,
-                truncated=self._truncated,
-                distance_m=self._errors["position_error_mm"] / 1000.0,
-                tilt_deg=self._errors["tilt_error_deg"],
-                joint_distance=None
-                if self._goal_configurations is None
-                else rewards.joint_distance(
-                    self.joint_positions(physics), self._goal_configurations
-                ),
-            ),
+        goal = self._draw_goal(streams)
+        # The plane through the origin that the whole surface lies in or below.
+        floor_normal = np.asarray(self._surface.normal(0.0, 0.0))
+        own = self.named.start if self.named is not None else "zero"
+        start = draw_start(self.spec, own, streams, goal, floor_normal)
+        return AlignScenario(
+            target=goal.target, normal=goal.normal, start=start, **draw_look(self.spec, streams)
         )
 
-    def get_reward(self, physics: mjcf.Physics) -> float:
-        """Sum of the reward terms of the last control step."""
-        del physics
-        return float(sum(self._reward_terms.values()))
+    def _draw_goal(self, streams: Streams) -> Goal:
+        asked = self.spec.goal
+        if isinstance(asked, tuple):
+            return self.goal_over(*asked)
+        if asked == "places":
+            places = fixed_places(*self.spec.ring_m)
+            return self.goal_over(*places[streams.index % len(places)])
+        # "fixed" is drawn once a split: from a stream of its own that ignores the index.
+        stream = f"target-{asked}"
+        random = streams.generator(stream) if asked == "random" else streams.once(stream)
+        for _ in range(1000):
+            goal = self.goal_over(*self.draw_on_ring(random))
+            # The ring is what the arm reaches over a flat surface; others lie partly lower.
+            if self.spec.surface == "flat" or is_reachable(goal):
+                return goal
+        raise OptionError(f"no target within reach found for scenario {streams.index}")
 
-    def get_discount(self, physics: mjcf.Physics) -> float:
-        """0 after goal or collision; truncation is no end of the world and keeps the discount."""
-        del physics
-        return 0.0 if self._is_final else self.variant.discount
+    def begin(self, physics: "mjcf.Physics", scenario: AlignScenario) -> None:
+        """Lay the marker on the target."""
+        super().begin(physics, scenario)
+        self._goal = Goal(scenario.target, scenario.normal, self.spec.standoff_m)
+        self.put_marker(physics, self._goal)
 
-    @property
-    def has_ended(self) -> bool:
-        """Goal (unless the environment plays on), collision or time limit."""
-        return self._is_final or self._truncated
-
-    def should_terminate_episode(self, physics: mjcf.Physics) -> bool:
-        """Goal or collision; the time limit is the environment's."""
-        del physics
-        return self._is_final
-
-    @property
-    def _is_final(self) -> bool:
-        return self._collision or (self._success and self.environment.goal_ends_episode)
-
-    def action_spec(self, physics: mjcf.Physics) -> specs.BoundedArray:
-        """Numbers in [-1, 1]; meaning in ``actions.set_point``."""
-        del physics
-        return actions.action_spec(self.variant.action_mode)
-
-    def textures_to_upload(self) -> tuple[int, ...]:
-        """The surface's texture, where the variant repaints it."""
-        return self._appearance.changed_textures
-
-    # --- what people ask ------------------------------------------------------------------------
-
-    @property
-    def scenario(self) -> Scenario:
-        """The scenario being played."""
-        if self._scenario is None:
-            raise RuntimeError("reset the environment first")
-        return self._scenario
-
-    @property
-    def is_inside(self) -> bool:
-        """Whether all errors lie within the tolerances now."""
-        return all(abs(self._errors[name]) <= bound for name, bound in self._tolerances.items())
-
-    @property
-    def reward_terms(self) -> dict[str, float]:
-        """Reward terms of the last control step by name."""
-        return dict(self._reward_terms)
-
-    def info(self) -> dict[str, Any]:
-        """Outcome so far.
-
-        Returns:
-            ``task`` and ``split`` (str), ``scenario`` (int), ``is_success``, ``success_once``
-            (inside tolerance at any control step's end), ``collision``, ``truncated`` (bool),
-            ``n_inside`` (control steps held so far), ``n_clipped`` (actions clipped) and
-            ``position_error_mm``, ``lateral_error_mm``, ``height_error_mm`` (absolute),
-            ``tilt_error_deg`` at the end of the last control step.
-        """
-        return {
-            "task": self.variant.name,
-            "split": self.source.split,
-            "scenario": self.scenario.index,
-            "is_success": self._success,
-            "success_once": self._inside_once,
-            "collision": self._collision,
-            "truncated": self._truncated,
-            "n_inside": self._n_inside,
-            "n_clipped": self._n_clipped,
-            **{name: abs(value) for name, value in self._errors.items()},
-        }
-
-    def privileged(self, physics: mjcf.Physics) -> dict[str, FloatArray]:
-        """What only training and the expert may see.
-
-        Returns:
-            ``joint_positions`` (7,) true, rad; ``joint_offset`` (7,) rad; ``goal_position`` (3,) m,
-            of the flange; ``goal_normal`` (3,); ``target_position`` (3,) m; ``target_eih`` and
-            ``target_eth`` (4,): u, v of the target's centre in [-1, 1] over the image (x right, y
-            down), apparent diameter in image widths, and 1 where it can be seen, else 0 (u, v and
-            diameter are then 0).
-        """
-        scenario = self.scenario
-        return {
-            "joint_positions": self.joint_positions(physics),
-            "joint_offset": scenario.joint_offset.copy(),
-            "goal_position": self.goal.copy(),
-            "goal_normal": scenario.normal.copy(),
-            "target_position": scenario.target.copy(),
-            "target_eih": self.target_in_image(physics, "eih"),
-            "target_eth": self.target_in_image(physics, "eth"),
-        }
-
-    def target_in_image(self, physics: mjcf.Physics, name: str) -> FloatArray:
-        """Where the target appears in a camera; see ``privileged``."""
-        camera = self.cameras[name]
-        data = physics.data.ptr
-        scenario = self.scenario
-        centre = scenario.target + scenario.normal * 2.0 * HALF_THICKNESS_M
-        eye = data.cam_xpos[camera.id]
-        # ``cameras.project`` in plain floats: this is asked for every frame that is recorded.
-        ax, ay, az, bx, by, bz, cx, cy, cz = data.cam_xmat[camera.id].tolist()
-        dx, dy, dz = (centre - eye).tolist()
-        depth = -(az * dx + bz * dy + cz * dz)
-        if depth <= 0.0:
-            return np.zeros(4)
-        focal, middle = camera.K[0, 0].item(), camera.K[0, 2].item()
-        u = focal * (ax * dx + bx * dy + cx * dz) / depth + middle
-        v = -focal * (ay * dx + by * dy + cy * dz) / depth + middle
-        # Pixel centres are whole, so the image spans from -1/2 to resolution - 1/2.
-        x = 2.0 * (u + 0.5) / camera.resolution - 1.0
-        y = 2.0 * (v + 0.5) / camera.resolution - 1.0
-        seen = max(abs(x), abs(y)) <= 1.0 and (eye - centre) @ scenario.normal > 0
-        if not seen or self._is_occluded(physics, eye, centre, own=name == "eih"):
-            return np.zeros(4)
-        diameter = focal * self.variant.target_diameter_m / depth / camera.resolution
-        return np.array([x, y, diameter, 1.0])
-
-    def joint_positions(self, physics: mjcf.Physics) -> FloatArray:
-        """True joint angles, (7,) rad."""
-        return physics.data.ptr.qpos[self._qpos].copy()
-
-    def joint_velocities(self, physics: mjcf.Physics) -> FloatArray:
-        """True joint speeds, (7,) rad/s."""
-        return physics.data.ptr.qvel[self._qvel].copy()
-
-    def flange_position(self, physics: mjcf.Physics) -> FloatArray:
-        """True position of the flange face's centre, (3,) m, base frame."""
-        return physics.data.ptr.site_xpos[self._flange].copy()
-
-    def measured_positions(self, physics: mjcf.Physics) -> FloatArray:
-        """Joint angles as the encoders show them, (7,) rad."""
-        return self.joint_positions(physics) + self.scenario.joint_offset
-
-    def setpoint(self, physics: mjcf.Physics) -> FloatArray:
-        """True joint set point that the controller tracks now, (7,) rad."""
-        return physics.data.ptr.act[self._act].copy()
-
-    def setpoint_velocity(self) -> FloatArray:
-        """Speed of the set point in the last control step, (7,) rad/s."""
-        return self._speed.copy()
-
-    def pending_setpoints(self) -> list[FloatArray]:
-        """True set points that were commanded and still wait out the latency, oldest first."""
-        return [target - self.scenario.joint_offset for target in self._queue]
-
-    def landing_mm(self, physics: mjcf.Physics) -> FloatArray:
-        """Where the flange's centre stands over the target, in the target plane.
-
-        Returns:
-            (2,) mm: along the base's x axis as the plane shows it, and across it (normal times
-            that); its norm is ``lateral_error_mm``.
-        """
-        normal = self.scenario.normal
-        along = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
-        along /= np.linalg.norm(along)
-        offset = 1000.0 * (self.flange_position(physics) - self.scenario.target)
-        return np.array([offset @ along, offset @ np.cross(normal, along)])
-
-    def commandable(self, q: npt.ArrayLike) -> npt.NDArray[np.float32]:
-        """The ``joint_position`` action that sends the arm to true joint angles.
-
-        Args:
-            q: True joint angles, (7,) rad.
-
-        Returns:
-            (7,) float32, clipped to [-1, 1].
-        """
-        encoder = np.asarray(q, np.float64) + self.scenario.joint_offset
-        return np.clip(encoder / JOINT_RANGE_RAD, -1.0, 1.0).astype(np.float32)
-
-    def place(self, physics: mjcf.Physics, q: FloatArray) -> None:
-        """Put the arm at rest at joint angles (7,) rad, for certificates and pictures."""
-        data = physics.data.ptr
-        data.qpos[self._qpos] = q
-        data.qvel[self._qvel] = 0.0
-        data.act[self._act] = q
-        mujoco.mj_step1(physics.model.ptr, data)
-        self._measure(physics)
-
-    def view(self, physics: mjcf.Physics, camera: str) -> int | mujoco.MjvCamera:
-        """Camera for pictures: ``eih``, ``eth``, or ``cell`` for a third-person view."""
-        del physics
-        if camera in self.cameras:
-            return self.cameras[camera].id
-        view = mujoco.MjvCamera()
-        view.type = mujoco.mjtCamera.mjCAMERA_FREE.value
-        view.lookat[:] = [0.0, 0.0, 0.48]
-        view.distance, view.azimuth, view.elevation = 2.15, 145.0, -22.0
-        return view
-
-    def _measure(self, physics: mjcf.Physics) -> None:
-        # Plain floats: on vectors of three, NumPy would cost a tenth of the control step.
-        data = physics.data.ptr
-        ax, ay, az = data.site_xmat[self._flange].tolist()[2::3]
-        dx, dy, dz = (data.site_xpos[self._flange] - self.scenario.target).tolist()
-        nx, ny, nz = self._normal
-        along = dx * nx + dy * ny + dz * nz
-        height = along - self.variant.standoff_m
-        lateral = math.hypot(dx - along * nx, dy - along * ny, dz - along * nz)
-        # atan2 keeps its precision for small angles, where arccos loses half the digits.
-        sine = math.hypot(ay * nz - az * ny, az * nx - ax * nz, ax * ny - ay * nx)
-        tilt = math.atan2(sine, -(ax * nx + ay * ny + az * nz))
-        self._errors = {
-            "position_error_mm": 1000.0 * math.hypot(lateral, height),
-            "lateral_error_mm": 1000.0 * lateral,
-            "height_error_mm": 1000.0 * height,
-            "tilt_error_deg": math.degrees(tilt),
-        }
-
-    def _is_occluded(
-        self, physics: mjcf.Physics, eye: FloatArray, centre: FloatArray, *, own: bool
-    ) -> bool:
-        ray = centre - eye
-        hit = np.zeros(1, np.int32)
-        # The eye-in-hand camera sits in the flange: its own link must not count.
-        length = mujoco.mj_ray(
-            physics.model.ptr,
-            physics.data.ptr,
-            eye,
-            ray,
-            self._rays,
-            1,
-            self._flange_body if own else -1,
-            hit,
-        )
-        return bool(0.0 <= length < 1.0 - _RAY_SLACK_M / float(np.linalg.norm(ray)))
-
-    def _clear_outcome(self) -> None:
-        self._n_inside = 0
-        self._n_clipped = 0
-        self._inside_once = False
-        self._success = False
-        self._collision = False
-        self._truncated = False
-        self._reward_terms = {}
+    def goal(self, ahead_s: float = 0.0) -> Goal:
+        """Over the target, at any time."""
+        return self._goal
 
 
-def _accelerate(speed: FloatArray, distance: FloatArray, period_s: float) -> FloatArray:
-    """Next set-point speed under acceleration limits, able to stop at the target.
-
-    The largest v with v T + (braking distance from v in steps of a T) <= distance solves
-    v^2 / (2 a) + v T / 2 = distance.
-
-    Args:
-        speed: Speed of the last control step, (7,) rad/s.
-        distance: Way to the target, (7,) rad.
-        period_s: Control period T (s).
-
-    Returns:
-        Speed, (7,) rad/s.
-    """
-    a, change = JOINT_ACCELERATION_RAD_S2, JOINT_ACCELERATION_RAD_S2 * period_s
-    brake = a * period_s * (np.sqrt(0.25 + 2.0 * np.abs(distance) / (a * period_s**2)) - 0.5)
-    wanted = np.sign(distance) * np.minimum(brake, np.abs(distance) / period_s)
-    return np.clip(wanted, speed - change, speed + change)
+@functools.cache
+def fixed_places(inner: float, outer: float) -> tuple[tuple[float, float], ...]:
+    """The ten places of ``align-fixed``: a golden-angle spiral, even in area over the ring (m)."""
+    places = []
+    for i in range(10):
+        radius = math.sqrt(inner**2 + (i + 0.5) / 10 * (outer**2 - inner**2))
+        azimuth = 0.5 + i * math.pi * (3.0 - math.sqrt(5.0))
+        places.append((radius * math.cos(azimuth), radius * math.sin(azimuth)))
+    return tuple(places)
 
 
-def _marker_orientation(normal: FloatArray) -> FloatArray:
-    """Quaternion that turns the marker's z axis to the normal."""
-    frame = tool_frame(-normal)
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, frame.ravel())
-    return quat
+_THESIS = AlignSpec(name="align-thesis", position_tolerance_mm=1.0, tilt_tolerance_deg=1.0)
+
+_HARD = dataclasses.replace(
+    _THESIS,
+    name="align-hard",
+    start="random",
+    target_diameter_m=0.020,
+    position_tolerance_mm=0.5,
+    tilt_tolerance_deg=0.5,
+    hold_steps=3,
+    time_limit_steps=40,
+    # A small disc leaves margin in a narrower view, which shows it larger.
+    eih_fov_deg=60.0,
+    eth_resolution=336,
+    # Wide enough for the ring when the camera is turned by the largest disturbance.
+    eth_fov_deg=33.0,
+    vary_light=True,
+    vary_colour=True,
+    vary_texture=True,
+    # Cut at two sigma: up to 1 cm and 1 deg a direction.
+    eth_position_noise_m=0.005,
+    eth_rotation_noise_deg=0.5,
+    image_noise=4.0,
+)
+
+register(
+    Align,
+    dataclasses.replace(
+        _THESIS,
+        name="align-fixed",
+        goal="places",
+        position_tolerance_mm=5.0,
+        tilt_tolerance_deg=5.0,
+    ),
+    dataclasses.replace(
+        _THESIS, name="align-easy", position_tolerance_mm=5.0, tilt_tolerance_deg=5.0
+    ),
+    _THESIS,
+    _HARD,
+    dataclasses.replace(
+        _HARD,
+        name="align-drill",
+        target_diameter_m=0.010,
+        position_tolerance_mm=None,
+        lateral_tolerance_mm=0.25,
+        height_tolerance_mm=1.0,
+        tilt_tolerance_deg=0.4,
+        hold_steps=5,
+        eih_resolution=224,
+        eth_resolution=512,
+        joint_offset_deg=0.05,
+        latency_steps=1,
+    ),
+    dataclasses.replace(
+        _THESIS,
+        name="align-limit",
+        start="random",
+        target_diameter_m=0.020,
+        position_tolerance_mm=None,
+        lateral_tolerance_mm=0.1,
+        height_tolerance_mm=0.3,
+        tilt_tolerance_deg=0.2,
+        hold_steps=5,
+        time_limit_steps=40,
+        eih_resolution=224,
+        eth_resolution=336,
+        eih_fov_deg=60.0,
+    ),
+)
+

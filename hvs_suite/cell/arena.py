@@ -1,4 +1,4 @@
-"""The cell as one MJCF model: robot on its surface, marker, two cameras, light."""
+"""The cell as one MJCF model: robot on its surface, two cameras, light, and a family's markers."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -6,18 +6,18 @@ from typing import Any
 from dm_control import composer, mjcf
 
 from hvs_suite.cell import cameras
-from hvs_suite.cell.marker import Marker, MarkerKind
+from hvs_suite.cell.marker import Marker
 from hvs_suite.cell.robot import PHYSICS_TIMESTEP_S, Iiwa7
-from hvs_suite.cell.surface import Surface, SurfaceShape
+from hvs_suite.cell.surface import Surface
 
 
 class Cell(composer.Arena):
-    """Robot, surface, marker, cameras and light.
+    """Robot, surface, cameras and light.
 
     Attributes:
         robot: The iiwa 7, its base at the origin.
         surface: The work surface.
-        marker: The target, a mocap body.
+        markers: The targets that a family added, mocap bodies.
         eih: MJCF camera in the hand.
         eth: MJCF camera over the cell, at its nominal pose.
         light: MJCF light over the cell.
@@ -26,16 +26,21 @@ class Cell(composer.Arena):
     def _build(
         self,
         *,
-        surface: SurfaceShape,
-        surface_size_m: tuple[float, float],
-        marker: MarkerKind,
-        target_diameter_m: float,
+        surface: Surface,
         eih_fov_deg: float,
         eth_fov_deg: float,
         eth_position_m: Sequence[float],
         eth_look_at_m: Sequence[float],
     ) -> None:
-        """Builds the cell; the arguments are those of ``AlignVariant``."""
+        """Builds the cell.
+
+        Args:
+            surface: What everything stands on.
+            eih_fov_deg: As in ``Spec``; likewise the three below.
+            eth_fov_deg: Field of view of the eye to hand.
+            eth_position_m: Its nominal position.
+            eth_look_at_m: Where it looks.
+        """
         super()._build(name="cell")
         root = self.mjcf_model
         root.option.timestep = PHYSICS_TIMESTEP_S
@@ -75,16 +80,20 @@ class Cell(composer.Arena):
             directional=True,
             castshadow=True,
         )
-        self.surface = Surface(shape=surface, size_m=surface_size_m)
+        self.surface = surface
         self.attach(self.surface)
         self.robot = Iiwa7()
         self.attach(self.robot)
-        self.marker = Marker(kind=marker, diameter_m=target_diameter_m)
-        self.attach(self.marker).mocap = True
+        self.markers: list[Marker] = []
         self.eih: Any = cameras.add_eye_in_hand(
             self.robot.flange_body, self.robot.flange, eih_fov_deg
         )
         self.eth: Any = cameras.add_eye_to_hand(root, eth_position_m, eth_look_at_m, eth_fov_deg)
+
+    def add_marker(self, marker: Marker) -> None:
+        """Adds a target, a mocap body, so that moving it changes the state and not the model."""
+        self.markers.append(marker)
+        self.attach(marker).mocap = True
 
     @property
     def mjcf_model(self) -> mjcf.RootElement:

@@ -60,7 +60,9 @@ class ServoTask(composer.Task, abc.ABC):
         """Whether a contact that exists now must never happen; asked after every substep."""
 
     @abc.abstractmethod
-    def finish_step(self, physics: mjcf.Physics, *, collided: bool, at_time_limit: bool) -> None:
+    def finish_step(
+        self, physics: mjcf.Physics, *, steps: int, collided: bool, at_time_limit: bool
+    ) -> None:
         """Compute errors, success and the ends of the episode at the end of a control step."""
 
     @abc.abstractmethod
@@ -178,6 +180,7 @@ class Environment(composer.Environment):
         self._control_steps += 1
         task.finish_step(
             physics,
+            steps=self._control_steps,
             collided=collided,
             at_time_limit=self._control_steps >= task.time_limit_steps,
         )
@@ -233,7 +236,7 @@ class Environment(composer.Environment):
     @property
     def variant(self) -> Any:
         """The task's parameters."""
-        return self.task.variant
+        return self.task.spec
 
     @property
     def split(self) -> str:

@@ -8,8 +8,14 @@ from typing import Any, Literal
 
 import cv2
 import imageio.v3 as iio
+import mujoco
 import numpy as np
+import numpy.typing as npt
 from dm_control import composer, mjcf
+
+from hvs_suite.cell.kinematics import tool_frame
+
+FloatArray = npt.NDArray[np.float64]
 
 MarkerKind = Literal["disc", "ring", "fiducial"]
 
@@ -97,6 +103,13 @@ class Marker(composer.Entity):
     def material(self) -> Any:
         """The marker's material."""
         return self._material
+
+
+def orientation(normal: FloatArray) -> FloatArray:
+    """Quaternion (4,) w x y z that turns a marker's z axis to a surface's outward normal (3,)."""
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, tool_frame(-normal).ravel())
+    return quat
 
 
 def _fiducial() -> bytes:

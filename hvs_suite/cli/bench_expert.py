@@ -11,7 +11,7 @@ from hvs_suite.cli import console
 
 if TYPE_CHECKING:
     from hvs_suite.rollout import Policy
-    from hvs_suite.tasks.variants import AlignVariant
+    from hvs_suite.tasks.shared.spec import Spec
 
 SPLIT = "test"
 SETTLING_STEPS = 1
@@ -93,7 +93,7 @@ def expert_figures(task: str, episodes: int) -> dict[str, float]:
 
 
 def least_times(
-    variant: "AlignVariant",
+    variant: "Spec",
     start: npt.NDArray[np.float64],
     goal: npt.NDArray[np.float64],
     normal: npt.NDArray[np.float64],

@@ -102,7 +102,7 @@ class Pretrain:
 def _folder(eyes: str) -> Path:
     """The checkpoint that eyes are taken from."""
     from hvs_suite.policies.catalogue import checkpoint_folder
-    from hvs_suite.tasks.variants import TASKS
+    from hvs_suite.registry import TASKS
 
     return checkpoint_folder("pretrained", eyes) if eyes in TASKS else Path(eyes)
 

@@ -30,7 +30,7 @@ class Reproduce:
         from hvs_suite.cli.main import parse
         from hvs_suite.eval.submission import EPISODES
         from hvs_suite.policies.recipe import recipe
-        from hvs_suite.tasks.scenario import TEST_SCENARIOS
+        from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS
 
         if self.episodes is not None and self.episodes < 1:
             raise OptionError(f"--episodes must be at least 1, not {self.episodes}")

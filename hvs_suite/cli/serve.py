@@ -54,7 +54,7 @@ def _tasks(policy: str) -> list[str]:
         PolicyError: There are none.
     """
     from hvs_suite.eval import protocol
-    from hvs_suite.tasks.variants import TASKS
+    from hvs_suite.registry import TASKS
 
     protocol.check_public(policy)
     found: list[str] = []

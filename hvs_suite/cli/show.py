@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from hvs_suite.cell.environment import Environment
-    from hvs_suite.tasks.certificate import Certificate, Check
-    from hvs_suite.tasks.variants import AlignVariant
+    from hvs_suite.tasks.shared.certificate import Certificate, Check
+    from hvs_suite.tasks.shared.spec import Spec
 
 CELL_PX = 720
 FIGURE_WIDTH_IN = 12.0
@@ -47,7 +47,7 @@ class Show:
         import hvs_suite
         from hvs_suite.errors import OutputError
         from hvs_suite.files import check_writable, replacing
-        from hvs_suite.tasks.certificate import load_certificate
+        from hvs_suite.tasks.shared.certificate import load_certificate
 
         if self.out.suffix.lower() != ".png":
             raise OutputError(f"{self.out} must end in .png")
@@ -109,7 +109,7 @@ def look(env: "Environment", scenario: int) -> tuple[Moment, Moment]:
 
 
 def draw(
-    variant: "AlignVariant", scenario: int, start: Moment, goal: Moment, certificate: "Certificate"
+    variant: "Spec", scenario: int, start: Moment, goal: Moment, certificate: "Certificate"
 ) -> "Figure":
     """Lay out the picture: start above goal, cell and cameras side by side, certificate below.
 

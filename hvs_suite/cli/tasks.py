@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from hvs_suite.cli import console
 
 if TYPE_CHECKING:
-    from hvs_suite.tasks.variants import AlignVariant
+    from hvs_suite.tasks.shared.spec import Spec
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -26,7 +26,7 @@ class Tasks:
         variants = hvs_suite.TASKS.values()
         if self.json:
             console.print_json(
-                [dataclasses.asdict(v) | {"instruction": v.instruction} for v in variants]
+                [dataclasses.asdict(v) | {"instruction": v.instruction()} for v in variants]
             )
             return
         console.print_table(
@@ -47,7 +47,7 @@ class Tasks:
         )
 
 
-def tolerance(variant: "AlignVariant") -> str:
+def tolerance(variant: "Spec") -> str:
     """A variant's tolerances in words, such as ``1 mm, 1 deg``."""
     parts = []
     if variant.position_tolerance_mm is not None:
@@ -59,7 +59,7 @@ def tolerance(variant: "AlignVariant") -> str:
     return ", ".join([*parts, f"{variant.tilt_tolerance_deg:g} deg"])
 
 
-def disturbances(variant: "AlignVariant") -> str:
+def disturbances(variant: "Spec") -> str:
     """What a variant varies besides start and goal, in words; a dash for nothing."""
     present = {
         "light": variant.vary_light,

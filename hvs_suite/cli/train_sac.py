@@ -69,7 +69,7 @@ class TrainSac:
         # Before SB3 is imported, which takes seconds.
         registry.find(self.task)
         from hvs_suite.policies.sac.training import train_sac
-        from hvs_suite.tasks.variants import THESIS_REWARDS
+        from hvs_suite.tasks.shared.spec import THESIS_REWARDS
 
         show_run(
             functools.partial(train_sac, self.task, self.out),

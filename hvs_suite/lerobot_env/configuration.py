@@ -13,7 +13,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 from hvs_suite.errors import OptionError
 from hvs_suite.gym import make_pixels_agent_pos
 from hvs_suite.registry import find
-from hvs_suite.tasks.variants import AlignVariant, observation_names, with_options
+from hvs_suite.tasks.shared.spec import Spec, observation_names
 
 _STATE_NAMES = ("joint_positions", "joint_velocities")
 _CAMERA_NAMES = ("eih", "eth")
@@ -53,7 +53,7 @@ class HvsEnvConfig(EnvConfig):
         self.features_map = {name: name for name in self.features}
 
     @property
-    def variant(self) -> AlignVariant:
+    def variant(self) -> Spec:
         """The task's parameters, options applied.
 
         Raises:
@@ -63,7 +63,7 @@ class HvsEnvConfig(EnvConfig):
         options = dict(self.options)
         if self.episode_length is not None:
             options["time_limit_steps"] = self.episode_length
-        return with_options(find(str(self.task)), options)
+        return find(str(self.task)).with_options(options)
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
@@ -97,7 +97,7 @@ class HvsEnvConfig(EnvConfig):
         return {self.type: {0: vector}}
 
 
-def _features(variant: AlignVariant) -> dict[str, PolicyFeature]:
+def _features(variant: Spec) -> dict[str, PolicyFeature]:
     """Features by their LeRobot names; image shapes are (H, W, C), as LeRobot asks of environments.
 
     Raises:

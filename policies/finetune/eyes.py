@@ -39,7 +39,7 @@ from hvs_suite.policies.hvs.network import (
 )
 from hvs_suite.policies.rl.evaluation import Evaluation, read_evaluations, write_evaluations
 from hvs_suite.policies.rl.journal import SCENES_A_SEED
-from hvs_suite.tasks.variants import AlignVariant
+from hvs_suite.tasks.shared.spec import Spec
 
 BATCH_SIZE = 64
 # Scenes of a seed that its RL does not get to: it would play for months.
@@ -51,7 +51,7 @@ ORDER_STREAM = 4
 def train_eyes(
     base: Path,
     folder: Path,
-    variant: AlignVariant,
+    variant: Spec,
     options: Mapping[str, Any],
     split: str,
     seed: int,

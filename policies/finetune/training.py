@@ -44,7 +44,7 @@ from hvs_suite.policies.rl.run import Budget, Outcome, Progress, Run, check_run
 from hvs_suite.policies.run_folder import claimed, write_train_config
 from hvs_suite.registry import find
 from hvs_suite.rollout import library_seeds, worker_conditions
-from hvs_suite.tasks.variants import AlignVariant, with_options
+from hvs_suite.tasks.shared.spec import Spec
 
 PACKAGES = ("hvs-suite", "mujoco", "numpy", "stable-baselines3", "torch")
 
@@ -98,7 +98,7 @@ def finetune(
     """
     settings = settings or Settings()
     options = dict(options or {})
-    variant = with_options(find(task), options)
+    variant = find(task).with_options(options)
     limit = Budget(steps, minutes)
     check_run(seed, split, eval_every, eval_episodes)
     levels = levels_of(task, curriculum) if curriculum is not None else [{}]
@@ -209,7 +209,7 @@ class _Finetuned:
 
     guards_success = True
 
-    def __init__(self, model: ResidualTD3, base: Path, out: Path, variant: AlignVariant) -> None:
+    def __init__(self, model: ResidualTD3, base: Path, out: Path, variant: Spec) -> None:
         self.model = model
         self._base = base
         self._out = out

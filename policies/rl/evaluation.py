@@ -13,7 +13,7 @@ from hvs_suite.pictures import film_episode, write_film
 from hvs_suite.registry import load
 from hvs_suite.rollout import Policy, run_episode
 from hvs_suite.statistics import wilson_interval
-from hvs_suite.tasks.variants import AlignVariant
+from hvs_suite.tasks.shared.spec import Spec
 
 if TYPE_CHECKING:
     from hvs_suite.cell.environment import Environment
@@ -74,7 +74,7 @@ class Examiner:
         episodes: Scenes to play.
     """
 
-    def __init__(self, variant: AlignVariant, options: Mapping[str, Any], episodes: int) -> None:
+    def __init__(self, variant: Spec, options: Mapping[str, Any], episodes: int) -> None:
         self._env: Environment = load(variant.name, split=SPLIT, **options)
         self.episodes = episodes
 

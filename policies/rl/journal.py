@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from stable_baselines3.common.monitor import Monitor
 
-from hvs_suite.tasks.variants import AlignVariant
+from hvs_suite.tasks.shared.spec import Spec
 
 SCENES_A_SEED = 10**9
 """Runs with different seeds learn from different scenes."""
@@ -133,7 +133,7 @@ class Journal(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def make_journal(
-    variant: AlignVariant, options: Mapping[str, Any], split: str, seed: int
+    variant: Spec, options: Mapping[str, Any], split: str, seed: int
 ) -> Journal:
     """Makes the Gymnasium environment of a named task, monitored and with a journal.
 

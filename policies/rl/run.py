@@ -31,7 +31,7 @@ from hvs_suite.policies.rl.journal import OUTCOMES
 from hvs_suite.policies.rl.plot import draw_rl_run
 from hvs_suite.policies.rl.state import Counters, Model, load_run, save_run
 from hvs_suite.rollout import Policy
-from hvs_suite.tasks.scenario import TEST_SPLIT
+from hvs_suite.tasks.shared.scenario import TEST_SPLIT
 
 LOG_EVERY = 10
 """Iterations between two points of a curve."""

@@ -18,7 +18,7 @@ from gymnasium import spaces
 from hvs_suite.errors import PolicyError
 from hvs_suite.files import replacing
 from hvs_suite.rollout import Observation, one_torch_thread
-from hvs_suite.tasks.variants import AlignVariant, observation_names
+from hvs_suite.tasks.shared.spec import Spec, observation_names
 
 if TYPE_CHECKING:
     from stable_baselines3.sac.policies import Actor
@@ -34,7 +34,7 @@ class Stage(Protocol):
     """What a checkpoint needs of an environment."""
 
     @property
-    def variant(self) -> AlignVariant:
+    def variant(self) -> Spec:
         """Parameters of the task."""
 
 
@@ -106,7 +106,7 @@ def is_sac(folder: Path) -> bool:
 
 
 def write_config(
-    folder: Path, variant: AlignVariant, observation_space: spaces.Dict, hidden: tuple[int, ...]
+    folder: Path, variant: Spec, observation_space: spaces.Dict, hidden: tuple[int, ...]
 ) -> None:
     """Write what is needed to make the actor again.
 
@@ -168,7 +168,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     return config
 
 
-def check_fit(config: Mapping[str, Any], folder: Path, variant: AlignVariant) -> None:
+def check_fit(config: Mapping[str, Any], folder: Path, variant: Spec) -> None:
     """Check that a task shows what the actor reads, in the same size, and takes its actions.
 
     Args:

@@ -26,12 +26,11 @@ from hvs_suite.policies.sac.playing import GreedyActor, save_actor, write_config
 from hvs_suite.policies.sac.settings import Settings
 from hvs_suite.registry import find
 from hvs_suite.rollout import library_seeds
-from hvs_suite.tasks.variants import (
+from hvs_suite.tasks.shared.spec import (
     PRESETS,
     THESIS_REWARDS,
-    AlignVariant,
+    Spec,
     observation_names,
-    with_options,
 )
 
 PACKAGES = ("hvs-suite", "mujoco", "numpy", "stable-baselines3", "torch")
@@ -85,7 +84,7 @@ def train_sac(
     """
     settings = settings or Settings()
     options = {**(options or {}), "rewards": tuple(rewards)}
-    variant = with_options(find(task), options)
+    variant = find(task).with_options(options)
     limit = Budget(steps, minutes)
     check_run(seed, split, eval_every, eval_episodes)
     _check(variant, device)
@@ -157,7 +156,7 @@ def _make_model(journal: Journal, settings: Settings, seed: int, device: str) ->
     )
 
 
-def _check(variant: AlignVariant, device: str) -> None:
+def _check(variant: Spec, device: str) -> None:
     others = [name for name in observation_names(variant.observations) if name not in INPUTS]
     if others or variant.normalise_observation:
         raise OptionError(

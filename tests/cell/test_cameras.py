@@ -12,7 +12,7 @@ from hvs_suite.cell import cameras
 from hvs_suite.cell.environment import Environment
 from hvs_suite.cell.marker import HALF_THICKNESS_M
 from hvs_suite.cell.renderer import Renderer
-from hvs_suite.tasks.detection import find_disc
+from hvs_suite.tasks.shared.detection import find_disc
 
 Named = Callable[..., Environment]
 FloatArray = npt.NDArray[np.float64]

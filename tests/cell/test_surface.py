@@ -8,7 +8,7 @@ from postures import displaced, goal_posture
 
 import hvs_suite
 from hvs_suite.cell.surface import CURVATURE_RADIUS_M, TILT_RAD, Surface, SurfaceShape
-from hvs_suite.tasks.detection import find_disc
+from hvs_suite.tasks.shared.detection import find_disc
 
 SHAPES: list[SurfaceShape] = ["flat", "tilted", "curved"]
 

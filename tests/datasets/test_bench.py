@@ -8,7 +8,7 @@ import pytest
 import hvs_suite
 from hvs_suite.cli.bench_expert import LABELS, least_times
 from hvs_suite.cli.main import run
-from hvs_suite.tasks.scenario import steps_lower_bound
+from hvs_suite.tasks.shared.scenario import steps_lower_bound
 
 
 def test_expert_figures_meet_the_bound(capsys):

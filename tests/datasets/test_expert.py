@@ -8,7 +8,7 @@ import hvs_suite
 from hvs_suite.cell import robot
 from hvs_suite.datasets.expert import make_expert, stopping_travel_time
 from hvs_suite.errors import OptionError
-from hvs_suite.tasks.scenario import steps_lower_bound
+from hvs_suite.tasks.shared.scenario import steps_lower_bound
 
 TASKS = sorted(hvs_suite.TASKS)
 COUNTS = [20, pytest.param(1000, marks=pytest.mark.slow)]

@@ -10,8 +10,7 @@ import hvs_suite
 from hvs_suite.cli.main import parse
 from hvs_suite.datasets.features import dataset_features
 from hvs_suite.datasets.metadata import read_metadata
-from hvs_suite.tasks.lock import digest
-from hvs_suite.tasks.variants import with_options
+from hvs_suite.tasks.shared.lock import digest
 
 ROOM = Path(__file__).parents[2] / "datasets"
 
@@ -38,7 +37,7 @@ def test_recipe_is_a_command_that_hvs_takes(task):
     assert command.task == task
     # Policies are scored on the test split: nobody trains on it.
     assert command.split == "train"
-    dataset_features(with_options(hvs_suite.TASKS[task], {"start": command.start}))
+    dataset_features(hvs_suite.TASKS[task].with_options({"start": command.start}))
 
 
 def test_the_sample_is_of_its_tasks_present_meaning():

@@ -11,7 +11,7 @@ from hvs_suite.cli.main import run
 from hvs_suite.datasets.archive import CHECKSUMS, pack, unpack
 from hvs_suite.datasets.card import write_card
 from hvs_suite.errors import DatasetError, OutputError
-from hvs_suite.tasks.lock import digest
+from hvs_suite.tasks.shared.lock import digest
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "align-thesis"
 DATA = "data/chunk-000/file-000.parquet"

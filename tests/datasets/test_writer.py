@@ -17,7 +17,7 @@ from hvs_suite.datasets.episode_stats import column_stats, merge_stats
 from hvs_suite.datasets.features import ROBOT_TYPE, dataset_features, image_key
 from hvs_suite.datasets.writer import STAGE, DatasetWriter
 from hvs_suite.errors import DatasetError
-from hvs_suite.tasks.variants import TASKS
+from hvs_suite.registry import TASKS
 
 OUTCOME = {"is_success": True, "collision": False}
 FPS, SENTENCE = 10, "Place the flange – centred – over the target."

@@ -8,7 +8,7 @@ import pytest
 from hvs_suite.cli import main
 from hvs_suite.errors import OptionError, PolicyError, ScenarioError, UnknownTaskError
 from hvs_suite.eval import protocol, result_file
-from hvs_suite.tasks.variants import TASKS
+from hvs_suite.registry import TASKS
 
 
 def test_zero_ends_after_exactly_the_number_of_steps_of_the_task() -> None:

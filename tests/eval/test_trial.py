@@ -19,8 +19,8 @@ from hvs_suite.cli import main
 from hvs_suite.errors import OutputError, PolicyError
 from hvs_suite.eval import action_log, protocol, result_file
 from hvs_suite.policies.catalogue import policy_factory
+from hvs_suite.registry import TASKS
 from hvs_suite.rollout import run_episode
-from hvs_suite.tasks.variants import TASKS
 
 TASK = "align-thesis"
 

@@ -12,11 +12,11 @@ import pytest
 import hvs_suite
 from hvs_suite.cli.main import COMMANDS
 from hvs_suite.errors import OptionError
-from hvs_suite.tasks.variants import AlignVariant, with_options
+from hvs_suite.tasks.shared.spec import Spec
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "thesis.md"
-FIELDS = {field.name for field in dataclasses.fields(AlignVariant)}
+FIELDS = {field.name for field in dataclasses.fields(Spec)}
 KEYWORDS = set(inspect.signature(hvs_suite.load).parameters)
 
 
@@ -66,7 +66,7 @@ def complaint(word, commands):
         return "no such option"
     if given:
         try:
-            with_options(hvs_suite.TASKS["align-thesis"], {name: ast.literal_eval(value)})
+            hvs_suite.TASKS["align-thesis"].with_options({name: ast.literal_eval(value)})
         except OptionError as error:
             return str(error)
     return ""

@@ -13,7 +13,7 @@ from hvs_suite.errors import PolicyError, UnknownTaskError
 from hvs_suite.policies import catalogue
 from hvs_suite.policies.catalogue import policy_factory
 from hvs_suite.policies.checkpoint import CheckpointPolicy
-from hvs_suite.tasks.variants import TASKS
+from hvs_suite.registry import TASKS
 
 
 def playground(split="test", scenario=0):

@@ -7,7 +7,7 @@ import pytest
 from hvs_suite.datasets.expert import Expert
 from hvs_suite.errors import OptionError, UnknownTaskError
 from hvs_suite.policies.rl.curriculum import Curriculum, levels_of
-from hvs_suite.tasks.variants import TASKS
+from hvs_suite.registry import TASKS
 
 STATE = {"observations": "state", "split": "train"}
 

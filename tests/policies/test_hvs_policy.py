@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from hvs_suite.policies.checkpoint import CheckpointPolicy
-from hvs_suite.tasks.variants import TASKS
+from hvs_suite.registry import TASKS
 
 
 @pytest.fixture(scope="module")

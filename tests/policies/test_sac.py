@@ -19,7 +19,7 @@ from hvs_suite.policies.sac.network import ThesisExtractor
 from hvs_suite.policies.sac.playing import SacFactory, check_fit, read_config
 from hvs_suite.policies.sac.settings import Settings
 from hvs_suite.policies.sac.training import train_sac
-from hvs_suite.tasks.variants import TASKS
+from hvs_suite.registry import TASKS
 
 pytestmark = pytest.mark.timeout(300)
 

@@ -24,7 +24,7 @@ from hvs_suite.policies.target_estimate import (
 )
 from hvs_suite.policies.target_search import TargetSearch
 from hvs_suite.rollout import run_episode
-from hvs_suite.tasks.variants import TASKS, with_options
+from hvs_suite.tasks.shared.spec import TASKS
 
 SPLIT = "dev"
 # Neither camera sees the target at the start of this scenario.
@@ -139,7 +139,7 @@ def test_latency_shows_in_when_the_arm_first_moves(latency):
     ],
 )
 def test_what_the_method_cannot_do_is_refused_in_one_line(options, reason):
-    variant = with_options(TASKS["align-thesis"], options)
+    variant = TASKS["align-thesis"].with_options(options)
     with pytest.raises(PolicyError, match=reason) as error:
         make_servo(PolicyContext(variant, {}, None, 0.1))
     assert "\n" not in str(error.value)

@@ -17,7 +17,7 @@ from hvs_suite.cell.robot import (
     JOINT_SPEED_RAD_S,
 )
 from hvs_suite.errors import ActionError
-from hvs_suite.tasks.actions import JOINT_DELTA_RAD, TWIST_ANGULAR_RAD_S, TWIST_LINEAR_M_S
+from hvs_suite.tasks.shared.actions import JOINT_DELTA_RAD, TWIST_ANGULAR_RAD_S, TWIST_LINEAR_M_S
 
 Named = Callable[..., Environment]
 MODES = {"joint_position": 7, "joint_delta": 7, "joint_velocity": 7, "flange_twist": 6}

@@ -7,8 +7,8 @@ import pytest
 
 import hvs_suite
 from hvs_suite.cell.environment import Environment
-from hvs_suite.tasks.appearance import surface_texture
-from hvs_suite.tasks.detection import find_disc
+from hvs_suite.tasks.shared.appearance import surface_texture
+from hvs_suite.tasks.shared.detection import find_disc
 
 Named = Callable[..., Environment]
 

@@ -10,8 +10,8 @@ import hvs_suite
 from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.datasets.expert import make_expert
 from hvs_suite.rollout import run_episode
-from hvs_suite.tasks import certificate, lock
-from hvs_suite.tasks.scenario import TEST_SCENARIOS
+from hvs_suite.tasks.shared import certificate, lock
+from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS
 
 # The lines that answer one of the four questions; each must stand in every certificate.
 QUESTIONS = ("reachable", "in time", "observable", "accurate", "solved")

@@ -9,7 +9,7 @@ from postures import posture_at
 
 import hvs_suite
 from hvs_suite.errors import HvsError, OptionError, UnknownTaskError
-from hvs_suite.tasks.variants import JOINT_LIMITS_DEG
+from hvs_suite.tasks.shared.spec import JOINT_LIMITS_DEG
 
 
 @pytest.mark.parametrize(
@@ -171,7 +171,7 @@ def test_the_goal_s_requirements_can_be_changed() -> None:
         assert not env.step(stay).last()
         assert env.step(stay).last()
         assert env.info["is_success"]
-        assert env.variant.instruction.endswith("120 mm above the surface.")
+        assert env.variant.instruction().endswith("120 mm above the surface.")
 
 
 def test_eye_to_hand_stands_where_it_is_told_to() -> None:

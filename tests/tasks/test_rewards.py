@@ -10,8 +10,8 @@ from postures import posture_at
 import hvs_suite
 from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.cell.robot import JOINT_RANGE_RAD
-from hvs_suite.tasks.rewards import StepOutcome, joint_distance, reward_terms
-from hvs_suite.tasks.variants import THESIS_REWARDS, AlignVariant, RewardTerm
+from hvs_suite.tasks.shared.rewards import StepOutcome, joint_distance, reward_terms
+from hvs_suite.tasks.shared.spec import THESIS_REWARDS, RewardTerm, Spec
 
 ON_THE_WAY = StepOutcome(
     success=False,
@@ -24,7 +24,7 @@ ON_THE_WAY = StepOutcome(
 ALL: tuple[RewardTerm, ...] = (*THESIS_REWARDS, "joint_space", "exponential")
 
 
-def variant(*rewards: RewardTerm, time_limit: str = "soft") -> AlignVariant:
+def variant(*rewards: RewardTerm, time_limit: str = "soft") -> Spec:
     return dataclasses.replace(
         hvs_suite.TASKS["align-thesis"],
         rewards=rewards,

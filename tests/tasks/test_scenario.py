@@ -15,8 +15,7 @@ from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.cell.robot import JOINT_RANGE_RAD
 from hvs_suite.cell.surface import Surface
 from hvs_suite.errors import OptionError, ScenarioError
-from hvs_suite.tasks.scenario import ScenarioSource, fixed_places, steps_lower_bound
-from hvs_suite.tasks.variants import with_options
+from hvs_suite.tasks.shared.scenario import ScenarioSource, fixed_places, steps_lower_bound
 
 Named = Callable[..., Environment]
 RANDOM_STARTS = [name for name, variant in hvs_suite.TASKS.items() if variant.start == "random"]

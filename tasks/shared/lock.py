@@ -12,7 +12,7 @@ import importlib.resources
 import json
 from typing import Any
 
-from hvs_suite.tasks.variants import AlignVariant
+from hvs_suite.tasks.shared.spec import Spec
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +57,7 @@ def digest(task: str) -> str:
     return lock()[task].digest
 
 
-def compute_entry(variant: AlignVariant) -> LockEntry:
+def compute_entry(variant: Spec) -> LockEntry:
     """Compute what a variant means now.
 
     Args:
@@ -67,10 +67,10 @@ def compute_entry(variant: AlignVariant) -> LockEntry:
         The entry; draws all test scenarios, which takes seconds.
     """
     from hvs_suite.cell.robot import robot_mjcf
-    from hvs_suite.cell.surface import Surface
-    from hvs_suite.tasks.scenario import TEST_SCENARIOS, TEST_SPLIT, ScenarioSource
+    from hvs_suite.registry import make_task
+    from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
 
-    source = ScenarioSource(variant, TEST_SPLIT, Surface(shape=variant.surface))
+    source = make_task(variant, TEST_SPLIT).source
     scenarios = "".join(source.draw(index).digest() for index in range(TEST_SCENARIOS))
     return LockEntry(
         version=variant.version,
@@ -80,7 +80,7 @@ def compute_entry(variant: AlignVariant) -> LockEntry:
     )
 
 
-def _fields(variant: AlignVariant) -> dict[str, Any]:
+def _fields(variant: Spec) -> dict[str, Any]:
     return dataclasses.asdict(variant)
 
 

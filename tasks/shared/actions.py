@@ -13,7 +13,7 @@ from dm_env import specs
 from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.cell.robot import JOINT_NAMES, JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
 from hvs_suite.errors import ActionError
-from hvs_suite.tasks.variants import ActionMode
+from hvs_suite.tasks.shared.spec import ActionMode
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""Reward terms of ``align``: the thesis's five and two further shapings, each switchable.
+"""Reward terms: the thesis's five and two further shapings, each switchable.
 
 Switching a term changes the reward and nothing else: success and termination never depend on it.
 """
@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.cell.robot import JOINT_RANGE_RAD
-from hvs_suite.tasks.variants import AlignVariant
+from hvs_suite.tasks.shared.goal import LATERAL, POSITION, TILT
+from hvs_suite.tasks.shared.spec import Spec
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -30,8 +31,8 @@ class StepOutcome:
         success: The goal was reached and held in this step.
         collision: A forbidden contact happened in this step.
         truncated: The time limit ended the episode.
-        distance_m: Norm of the position error (m).
-        tilt_deg: Tilt error (deg).
+        distance_m: Norm of the position error to the goal (m), or None where no term needs it.
+        tilt_deg: Tilt error (deg), likewise.
         joint_distance: Distance to the nearest goal configuration: the largest joint difference as
             a fraction of that joint's full range, or None where the term is off.
     """
@@ -39,28 +40,28 @@ class StepOutcome:
     success: bool
     collision: bool
     truncated: bool
-    distance_m: float
-    tilt_deg: float
+    distance_m: float | None
+    tilt_deg: float | None
     joint_distance: float | None
 
 
-def reward_terms(variant: AlignVariant, outcome: StepOutcome) -> dict[str, float]:
+def reward_terms(spec: Spec, outcome: StepOutcome) -> dict[str, float]:
     """Reward terms of one control step, switched-on ones only; their sum is the reward.
 
     A collision (-r*) replaces everything else. While the goal is not reached, ``time`` costs 0.05 a
     step and the shapings pay at most 0.4 r* each: ``position`` 0.4 r* (L - d) / L with
-    L = 2 r_max - tolerance, ``rotation`` 0.4 r* (A - a) / A with A = 180 deg - tolerance (both in
+    L = 2 reach - tolerance, ``rotation`` 0.4 r* (A - a) / A with A = 180 deg - tolerance (both in
     full within tolerance), ``joint_space`` 0.4 r* (1 - joint distance), ``exponential``
     0.4 r* exp(-d / 50 mm). A hard time limit costs r* when it strikes.
 
     Args:
-        variant: Which terms are on, and the tolerances.
+        spec: Which terms are on, and the tolerances.
         outcome: The control step.
 
     Returns:
         Term by name.
     """
-    on = variant.rewards
+    on = spec.rewards
     if outcome.collision:
         return {"collision": -GOAL_REWARD} if "collision" in on else {}
     if outcome.success:
@@ -68,18 +69,19 @@ def reward_terms(variant: AlignVariant, outcome: StepOutcome) -> dict[str, float
     terms: dict[str, float] = {}
     if "time" in on:
         terms["time"] = -TIME_COST
-    if "position" in on:
-        tolerance = 1e-3 * (variant.position_tolerance_mm or variant.lateral_tolerance_mm or 0.0)
-        length = 2.0 * variant.ring_m[1] - tolerance
+    bounds = spec.step_bounds
+    if "position" in on and outcome.distance_m is not None:
+        tolerance = 1e-3 * bounds.get(POSITION, bounds.get(LATERAL, 0.0))
+        length = 2.0 * spec.reach_m - tolerance
         terms["position"] = SHAPING_WEIGHT * _linear(outcome.distance_m, tolerance, length)
-    if "rotation" in on:
-        tolerance = variant.tilt_tolerance_deg
+    if "rotation" in on and outcome.tilt_deg is not None:
+        tolerance = bounds.get(TILT, 0.0)
         terms["rotation"] = SHAPING_WEIGHT * _linear(outcome.tilt_deg, tolerance, 180.0 - tolerance)
     if "joint_space" in on and outcome.joint_distance is not None:
         terms["joint_space"] = SHAPING_WEIGHT * (1.0 - outcome.joint_distance)
-    if "exponential" in on:
+    if "exponential" in on and outcome.distance_m is not None:
         terms["exponential"] = SHAPING_WEIGHT * math.exp(-outcome.distance_m / EXPONENTIAL_LENGTH_M)
-    if outcome.truncated and variant.time_limit == "hard":
+    if outcome.truncated and spec.time_limit == "hard":
         terms["time_limit"] = -GOAL_REWARD
     return terms
 

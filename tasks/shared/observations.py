@@ -15,10 +15,10 @@ from dm_env import specs
 
 from hvs_suite.cell import cameras
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
-from hvs_suite.tasks.variants import observation_names
+from hvs_suite.tasks.shared.spec import observation_names
 
 if TYPE_CHECKING:
-    from hvs_suite.tasks.align import Align
+    from hvs_suite.tasks.shared.arm_task import ArmTask
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -53,8 +53,8 @@ class VectorObservable(observable.Observable):
         return lambda: self._read(physics).astype(self._spec.dtype)
 
 
-def make_observables(task: "Align") -> dict[str, observable.Observable]:
-    """Build exactly the observables that the task's variant names, enabled.
+def make_observables(task: "ArmTask") -> dict[str, observable.Observable]:
+    """Build exactly the observables that the task's spec names, enabled.
 
     Args:
         task: The task they read from.
@@ -65,10 +65,10 @@ def make_observables(task: "Align") -> dict[str, observable.Observable]:
         privileged: ``flange_position``, ``goal_position`` (3,) m, ``goal_normal`` (3,). With
         ``normalise_observation`` pictures are float32 in [0, 1] and joints in [-1, 1].
     """
-    variant = task.variant
-    bank = _noise_bank(variant.image_noise) if variant.image_noise > 0 else None
+    spec = task.spec
+    bank = _noise_bank(spec.image_noise) if spec.image_noise > 0 else None
     built: dict[str, observable.Observable] = {}
-    for name in observation_names(variant.observations):
+    for name in observation_names(spec.observations):
         if name in ("eih", "eth"):
             built[name] = _picture(task, name, bank)
         elif name in ("eih_depth", "eth_depth"):
@@ -79,11 +79,11 @@ def make_observables(task: "Align") -> dict[str, observable.Observable]:
     return built
 
 
-def _picture(task: "Align", name: str, bank: npt.NDArray[np.int16] | None) -> Any:
-    variant = task.variant
-    side = variant.eih_resolution if name == "eih" else variant.eth_resolution
-    channels = variant.eih_channels if name == "eih" else variant.eth_channels
-    normalise = variant.normalise_observation
+def _picture(task: "ArmTask", name: str, bank: npt.NDArray[np.int16] | None) -> Any:
+    spec = task.spec
+    side = spec.eih_resolution if name == "eih" else spec.eth_resolution
+    channels = spec.eih_channels if name == "eih" else spec.eth_channels
+    normalise = spec.normalise_observation
 
     def take(physics: mjcf.Physics) -> npt.NDArray[Any]:
         image = task.environment.renderer.colour(
@@ -109,9 +109,9 @@ def _picture(task: "Align", name: str, bank: npt.NDArray[np.int16] | None) -> An
     return cameras.CameraImage(take, spec)
 
 
-def _depth(task: "Align", name: str) -> Any:
+def _depth(task: "ArmTask", name: str) -> Any:
     camera = name.removesuffix("_depth")
-    side = task.variant.eih_resolution if camera == "eih" else task.variant.eth_resolution
+    side = task.spec.eih_resolution if camera == "eih" else task.spec.eth_resolution
 
     def take(physics: mjcf.Physics) -> npt.NDArray[Any]:
         return task.environment.renderer.depth(
@@ -123,16 +123,16 @@ def _depth(task: "Align", name: str) -> Any:
     )
 
 
-def _vector(task: "Align", name: str) -> VectorObservable:
+def _vector(task: "ArmTask", name: str) -> VectorObservable:
     reads: dict[str, tuple[Callable[[mjcf.Physics], FloatArray], FloatArray]] = {
         "joint_positions": (task.measured_positions, POSITION_BOUND_RAD),
         "joint_velocities": (task.joint_velocities, SPEED_BOUND_RAD_S),
         "flange_position": (task.flange_position, np.full(3, _STATE_BOUND_M)),
-        "goal_position": (lambda physics: task.goal, np.full(3, _STATE_BOUND_M)),
-        "goal_normal": (lambda physics: task.scenario.normal, np.ones(3)),
+        "goal_position": (lambda physics: task.goal().position, np.full(3, _STATE_BOUND_M)),
+        "goal_normal": (lambda physics: task.goal().normal, np.ones(3)),
     }
     read, bound = reads[name]
-    if task.variant.normalise_observation and name.startswith("joint_"):
+    if task.spec.normalise_observation and name.startswith("joint_"):
         scale = JOINT_RANGE_RAD if name == "joint_positions" else JOINT_SPEED_RAD_S
 
         def normalised(physics: mjcf.Physics) -> FloatArray:

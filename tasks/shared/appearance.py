@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from hvs_suite.cell.arena import Cell
 from hvs_suite.cell.surface import TEXTURE_SIDE_PX
-from hvs_suite.tasks.scenario import Scenario
+from hvs_suite.tasks.shared.scenario import Scenario
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -38,7 +38,9 @@ class Appearance:
         self._eth = int(physics.bind(cell.eth).element_id)
         self._light = int(physics.bind(cell.light).element_id)
         self._surface = int(physics.bind(cell.surface.material).element_id)
-        self._target = int(physics.bind(cell.marker.material).element_id)
+        self._targets = [
+            int(physics.bind(marker.material).element_id) for marker in cell.markers
+        ]
         self._shells = np.array(physics.bind(cell.robot.shell_geoms).element_id, int).ravel()
         self._texture = int(physics.bind(cell.surface.texture).element_id)
         self._defaults: dict[str, npt.NDArray[Any]] = {
@@ -66,7 +68,7 @@ class Appearance:
         if scenario.surface_rgb is not None:
             model.mat_rgba[self._surface, :3] = scenario.surface_rgb
         if scenario.target_rgb is not None:
-            model.mat_rgba[self._target, :3] = scenario.target_rgb
+            model.mat_rgba[self._targets, :3] = scenario.target_rgb
         self._tint_robot(model, scenario.robot_tint)
         model.cam_pos[self._eth] += scenario.eth_shift
         turn = Rotation.from_rotvec(scenario.eth_turn)

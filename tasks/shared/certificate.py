@@ -2,7 +2,8 @@
 
 Four questions: can the goal be *reached* within the joint ranges; is there *time*; can the target
 be *seen* well enough for every tolerance; and is the task *solved* by the expert? The first three
-are answered here; the fourth takes rollouts, so ``hvs_suite.certify`` adds it. Scenarios are never
+are answered here, by checks that families choose from; the fourth takes rollouts, so
+``hvs_suite.certify`` adds it. Scenarios are never
 filtered: a task that fails is changed instead.
 """
 
@@ -18,8 +19,9 @@ import numpy.typing as npt
 
 from hvs_suite.cell.kinematics import kinematics, travel_time
 from hvs_suite.cell.robot import JOINT_RANGE_RAD
-from hvs_suite.tasks.detection import find_disc
-from hvs_suite.tasks.scenario import Scenario, steps_lower_bound
+from hvs_suite.tasks.shared.detection import find_disc
+from hvs_suite.tasks.shared.goal import Goal
+from hvs_suite.tasks.shared.start import steps_lower_bound
 
 if TYPE_CHECKING:
     from hvs_suite.cell.environment import Environment
@@ -110,16 +112,16 @@ def check_geometry(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
     Returns:
         Checks of the joint margin and of the steps that the fastest motion takes.
     """
-    variant, model = env.variant, kinematics()
+    spec = env.variant
     margins, bounds = [], []
+    env.draws = False
     for index in scenarios:
-        scenario: Scenario = env.task.source.draw(index)
-        goal = scenario.target + scenario.normal * variant.standoff_m
-        family = model.goal_configurations(goal, scenario.normal)
-        margin = (JOINT_RANGE_RAD - np.abs(family)).min(axis=1)
-        margins.append(np.rad2deg(margin.max()) if len(family) else -math.inf)
-        bounds.append(steps_lower_bound(variant, scenario.start, goal, scenario.normal))
-    limit = variant.time_limit_steps
+        env.reset(scenario=index)
+        goal = env.task.goal()
+        margins.append(joint_margin_deg(goal))
+        bounds.append(steps_lower_bound(spec, env.scenario.start, goal))
+    env.draws = True
+    limit = spec.time_limit_steps
     return [
         Check(
             "reachable: least margin to a joint stop, best posture",
@@ -144,27 +146,27 @@ def check_visibility(env: "Environment", scenarios: Iterable[int]) -> list[Check
         scenarios: Indices to check.
 
     Returns:
-        Checks of the rendered footprint in ETH, of a detection test under the variant's own noise,
+        Checks of the rendered footprint in ETH, of a detection test under the task's own noise,
         of the share of scenes that start hidden, and of looking first and then going.
     """
-    variant = env.variant
+    spec = env.variant
     footprints, misses, hidden, look_bounds, n = [], [], 0, [], 0
     for index in scenarios:
         n += 1
         observation = env.reset(scenario=index).observation
-        eth, eih = (env.task.target_in_image(env.physics, name) for name in ("eth", "eih"))
+        eth, eih = (_target_in(env, name) for name in ("eth", "eih"))
         if eth[3]:
-            side = variant.eth_resolution
+            side = spec.eth_resolution
             camera = env.task.cameras["eth"]
             ids = env.renderer.segmentation(env.physics.data.ptr, camera.id, side, side)
-            footprints.append(int((ids == env.task.marker_geom).sum()))
+            footprints.append(int((ids == env.task.family.marker_geom).sum()))
             found = find_disc(observation["eth"])
             true = (eth[:2] + 1.0) / 2.0 * side - 0.5
             misses.append(math.hypot(*(found.centre - true)) if found is not None else math.inf)
         elif not eih[3]:
             hidden += 1
             look_bounds.append(_steps_look_and_go(env))
-    limit = variant.time_limit_steps
+    limit = spec.time_limit_steps
     found_share = 100.0 * float(np.mean(np.array(misses) <= 1.5))
     checks = [
         Check(
@@ -201,7 +203,7 @@ def check_visibility(env: "Environment", scenarios: Iterable[int]) -> list[Check
 def check_accuracy(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
     """Do the disturbances leave enough of every tolerance?
 
-    At the goal posture of each scenario the disc is found in EIH under the variant's own noise, and
+    At the goal posture of each scenario the disc is found in EIH under the task's own noise, and
     encoder errors are passed through the kinematics. *Lateral* comes from the disc's centre, and a
     tilt that the joints hide shifts the flange by standoff * tan(tilt). *Tilt* comes from the
     joints: a disc does not show it. *Height* comes from the joints or from the disc's apparent
@@ -212,30 +214,30 @@ def check_accuracy(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
         scenarios: Indices to check.
 
     Returns:
-        One check for each tolerance of the variant.
+        One check for each tolerance of the task.
     """
-    variant = env.variant
+    spec = env.variant
     rows = np.array([_errors_at_goal(env, index) for index in scenarios])
     # Who measures a diameter calibrates it: what the median is off by is no error.
     rows[:, 2] = np.abs(rows[:, 2] - np.median(rows[:, 2]))
     tilt_deg, joint_height, image_height, image_lateral = np.percentile(rows, _PERCENTILE, axis=0)
     lateral = math.hypot(
-        image_lateral, 1000.0 * variant.standoff_m * math.tan(math.radians(tilt_deg))
+        image_lateral, 1000.0 * spec.standoff_m * math.tan(math.radians(tilt_deg))
     )
     height_source = "joints" if joint_height <= image_height else "disc's diameter in EIH"
     lateral += CONTROL_RESIDUAL_MM
     height = min(joint_height, image_height) + CONTROL_RESIDUAL_MM
     budget = [
-        ("lateral", "disc's centre in EIH", lateral, variant.lateral_tolerance_mm, "mm"),
-        ("height", height_source, height, variant.height_tolerance_mm, "mm"),
+        ("lateral", "disc's centre in EIH", lateral, spec.lateral_tolerance_mm, "mm"),
+        ("height", height_source, height, spec.height_tolerance_mm, "mm"),
         (
             "position",
             f"disc's centre in EIH, height from {height_source}",
             math.hypot(lateral, height),
-            variant.position_tolerance_mm,
+            spec.position_tolerance_mm,
             "mm",
         ),
-        ("tilt", "joints", tilt_deg, variant.tilt_tolerance_deg, "deg"),
+        ("tilt", "joints", tilt_deg, spec.tilt_tolerance_deg, "deg"),
     ]
     return [
         Check(
@@ -261,8 +263,7 @@ def solved_check(n_success: int, n_collision: int, n: int, mean_steps: float) ->
 
 def _steps_look_and_go(env: "Environment") -> int:
     """Least steps to a posture from which a camera sees the target, and on to the goal."""
-    variant, scenario = env.variant, env.scenario
-    goal = scenario.target + scenario.normal * variant.standoff_m
+    spec, scenario, goal = env.variant, env.scenario, env.task.goal()
     best = 10**6
     for lean in _LOOK_LEAN_RAD:
         for turn in np.arange(_LOOK_TURNS) * 2.0 * math.pi / _LOOK_TURNS:
@@ -273,23 +274,37 @@ def _steps_look_and_go(env: "Environment") -> int:
             if np.any(np.abs(posture) > JOINT_RANGE_RAD) or not _sees(env, posture):
                 continue
             look = float(travel_time(scenario.start, posture[None], acceleration_limits=True)[0])
-            steps = math.ceil(look / variant.control_period_s - 1e-9)
-            best = min(best, steps + steps_lower_bound(variant, posture, goal, scenario.normal))
+            steps = math.ceil(look / spec.control_period_s - 1e-9)
+            best = min(best, steps + steps_lower_bound(spec, posture, goal))
     return best
 
 
 def _sees(env: "Environment", posture: FloatArray) -> bool:
     env.task.place(env.physics, posture)
-    return any(env.task.target_in_image(env.physics, name)[3] for name in ("eth", "eih"))
+    return any(_target_in(env, name)[3] for name in ("eth", "eih"))
+
+
+def _target_in(env: "Environment", camera: str) -> FloatArray:
+    """Where the family's first keypoint appears in a camera, (4,), as in ``ArmTask.privileged``."""
+    keypoint = next(iter(env.task.family.keypoints().values()))
+    found: FloatArray = env.task.in_image(env.physics, keypoint, camera)
+    return found
+
+
+def joint_margin_deg(goal: Goal) -> float:
+    """Least margin to a joint stop in a goal's best posture (deg); -inf where it is out of reach."""
+    family = kinematics().goal_configurations(goal.position, goal.normal)
+    if not len(family):
+        return -math.inf
+    return float(np.rad2deg((JOINT_RANGE_RAD - np.abs(family)).min(axis=1).max()))
 
 
 def _errors_at_goal(env: "Environment", index: int) -> tuple[float, float, float, float]:
     """Tilt error (deg), height error by joints, height by image, lateral error by image (mm)."""
-    variant, model = env.variant, kinematics()
+    model = kinematics()
     env.reset(scenario=index)
-    scenario: Scenario = env.scenario
-    goal = scenario.target + scenario.normal * variant.standoff_m
-    family = model.goal_configurations_at_tool_angle(goal, scenario.normal, 0.0)
+    scenario, goal = env.scenario, env.task.goal()
+    family = model.goal_configurations_at_tool_angle(goal.position, goal.normal, 0.0)
     times = travel_time(scenario.start, family, acceleration_limits=True)
     posture = family[int(times.argmin())]
     true_R, true_p = model.flange_pose(posture)
@@ -300,33 +315,18 @@ def _errors_at_goal(env: "Environment", index: int) -> tuple[float, float, float
             float(true_R[:, 2] @ believed_R[:, 2]),
         )
     )
-    joint_height = 1000.0 * abs(float((believed_p - true_p) @ scenario.normal))
+    joint_height = 1000.0 * abs(float((believed_p - true_p) @ goal.normal))
     env.task.place(env.physics, posture)
     found = find_disc(env.task.observables["eih"](env.physics, None))
     if found is None:
         return tilt, joint_height, math.inf, math.inf
     camera = env.task.cameras["eih"]
-    seen = env.task.target_in_image(env.physics, "eih")
+    seen = _target_in(env, "eih")
     true_px = (seen[:2] + 1.0) / 2.0 * camera.resolution - 0.5
-    mm_per_px = 1000.0 * variant.standoff_m / camera.K[0, 0]
+    mm_per_px = 1000.0 * goal.standoff_m / camera.K[0, 0]
     lateral = mm_per_px * math.hypot(*(found.centre - true_px))
-    height = 1000.0 * variant.standoff_m * seen[2] * camera.resolution / found.diameter
+    height = 1000.0 * goal.standoff_m * seen[2] * camera.resolution / found.diameter
     return tilt, joint_height, height, lateral
-
-
-def certify(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
-    """All checks that need no rollouts.
-
-    Args:
-        env: The named task on its test split.
-        scenarios: Indices to check.
-    """
-    indices = list(scenarios)
-    return [
-        *check_geometry(env, indices),
-        *check_visibility(env, indices),
-        *check_accuracy(env, indices),
-    ]
 
 
 def as_dict(certificate: Certificate) -> dict[str, Any]:

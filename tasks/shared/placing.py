@@ -1,0 +1,195 @@
+"""What the families share in which the tool is placed over a marker, facing it, at a distance.
+
+The marker is one small thing on the work surface, drawn within the ring that the arm reaches. What
+is measured is where the tool's tip stands over it and how far its axis is from the normal there.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from hvs_suite.errors import OptionError
+from hvs_suite.tasks.shared.family import Family
+from hvs_suite.tasks.shared.goal import (
+    HEIGHT,
+    LATERAL,
+    POSITION,
+    TILT,
+    Goal,
+    Keypoint,
+    Tip,
+    goal_errors,
+)
+from hvs_suite.tasks.shared.metric import Metric
+from hvs_suite.tasks.shared.scenario import Scenario
+from hvs_suite.tasks.shared.spec import Spec, scene
+
+if TYPE_CHECKING:
+    from dm_control import mjcf
+
+    from hvs_suite.cell.arena import Cell
+    from hvs_suite.cell.environment import Environment
+    from hvs_suite.tasks.shared.certificate import Check
+
+FloatArray = npt.NDArray[np.float64]
+
+UP: FloatArray = np.array([0.0, 0.0, 1.0])
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlacingSpec(Spec):
+    """Parameters of placing the flange over a marker.
+
+    Attributes:
+        ring_m: Inner and outer radius of the ring of targets (m).
+        target_diameter_m: Diameter of the marker (m).
+        marker: Picture on the target.
+        standoff_m: Distance from surface to flange face at the goal (m).
+        position_tolerance_mm: Bound on the norm of the position error, or None where each
+            component has its own bound.
+        lateral_tolerance_mm: Bound on the error in the target plane, or None.
+        height_tolerance_mm: Bound on the error along the normal, or None.
+        tilt_tolerance_deg: Bound on the angle between flange axis and inward surface normal.
+    """
+
+    ring_m: tuple[float, float] = scene((0.40, 0.78))
+    target_diameter_m: float = 0.050
+    marker: Literal["disc", "ring", "fiducial"] = "disc"
+    standoff_m: float = scene(0.050)
+    position_tolerance_mm: float | None = 1.0
+    lateral_tolerance_mm: float | None = None
+    height_tolerance_mm: float | None = None
+    tilt_tolerance_deg: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse values that make no sense, with a sentence.
+
+        Raises:
+            OptionError: One of them does not.
+        """
+        super().__post_init__()
+        self._check(
+            "must be positive",
+            lambda value: value > 0,
+            "target_diameter_m",
+            "standoff_m",
+            "tilt_tolerance_deg",
+        )
+        for name in ("position_tolerance_mm", "lateral_tolerance_mm", "height_tolerance_mm"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise OptionError(f"{name} is {value}; it must be positive, or None for no bound")
+        if self.position_tolerance_mm is None and None in (
+            self.lateral_tolerance_mm,
+            self.height_tolerance_mm,
+        ):
+            raise OptionError(
+                "give position_tolerance_mm, or both lateral_tolerance_mm and height_tolerance_mm"
+            )
+        if not 0.0 < self.ring_m[0] < self.ring_m[1]:
+            raise OptionError(f"ring_m is {self.ring_m}; use an inner and a larger outer radius")
+
+    @property
+    def metrics(self) -> tuple[Metric, ...]:
+        """Position, lateral, height and tilt error at the end of each control step."""
+        return (
+            Metric(POSITION, "mm", "position error", self.position_tolerance_mm),
+            Metric(LATERAL, "mm", "lateral error", self.lateral_tolerance_mm),
+            Metric(HEIGHT, "mm", "height error", self.height_tolerance_mm),
+            Metric(TILT, "deg", "tilt error", self.tilt_tolerance_deg),
+        )
+
+    @property
+    def reach_m(self) -> float:
+        """Outer radius of the ring (m)."""
+        return self.ring_m[1]
+
+    def instruction(self, scenario: Scenario | None = None) -> str:
+        """The task as one sentence, identical in environment and dataset."""
+        return (
+            f"Place the flange centred over the target, facing it, "
+            f"{self.standoff_m * 1000:.0f} mm above the surface."
+        )
+
+
+class Placing[S: PlacingSpec, C: Scenario](Family[S, C]):
+    """One marker, whose place is the goal; families say where it is and how it moves."""
+
+    def build(self, cell: "Cell") -> None:
+        """Attach the marker, a mocap body, to the cell."""
+        from hvs_suite.cell.marker import Marker
+
+        self.marker = Marker(kind=self.spec.marker, diameter_m=self.spec.target_diameter_m)
+        cell.add_marker(self.marker)
+
+    def after_compile(self, physics: "mjcf.Physics") -> None:
+        """Look up the marker in the compiled model."""
+        self.marker_geom = int(physics.bind(self.marker.geom).element_id)
+        self._mocap = int(physics.model.body_mocapid[physics.model.geom_bodyid[self.marker_geom]])
+
+    def put_marker(self, physics: "mjcf.Physics", goal: Goal) -> None:
+        """Lay the marker where a goal's target is."""
+        from hvs_suite.cell.marker import orientation
+
+        physics.data.ptr.mocap_pos[self._mocap] = goal.target
+        physics.data.ptr.mocap_quat[self._mocap] = orientation(goal.normal)
+
+    def measure(self, tip: Tip) -> dict[str, float]:
+        """Errors of the tip to the present goal; see `goal_errors`."""
+        return goal_errors(tip, self.goal())
+
+    def keypoints(self) -> dict[str, Keypoint]:
+        """The centre of the marker's face."""
+        from hvs_suite.cell.marker import HALF_THICKNESS_M
+
+        goal = self.goal()
+        centre = goal.target + goal.normal * 2.0 * HALF_THICKNESS_M
+        return {"target": Keypoint(centre, goal.normal, self.spec.target_diameter_m)}
+
+    def draw_on_ring(self, random: np.random.Generator) -> tuple[float, float]:
+        """Draw a point of the ring, uniform in area (m, base frame)."""
+        inner, outer = self.spec.ring_m
+        radius = math.sqrt(random.uniform(inner**2, outer**2))
+        azimuth = random.uniform(-math.pi, math.pi)
+        return radius * math.cos(azimuth), radius * math.sin(azimuth)
+
+    def goal_over(self, x: float, y: float) -> Goal:
+        """The goal over a point of the level surface (m, base frame)."""
+        return Goal(np.array([x, y, 0.0]), UP, self.spec.standoff_m)
+
+    def check_ring(self) -> None:
+        """Check that the whole ring on the level surface is within reach.
+
+        Raises:
+            OptionError: It is not.
+        """
+        for radius in self.spec.ring_m:
+            if not is_reachable(self.goal_over(radius, 0.0)):
+                raise OptionError(
+                    f"ring_m is {self.spec.ring_m}: the arm cannot face the surface at a radius of "
+                    f"{radius} m, {self.spec.standoff_m} m off it; use radii from 0.40 to 0.78 m"
+                )
+
+    @classmethod
+    def certify(cls, env: "Environment", scenarios: Iterable[int]) -> list["Check"]:
+        """Reachable, in time, observable and accurate."""
+        from hvs_suite.tasks.shared import certificate
+
+        indices = list(scenarios)
+        return [
+            *certificate.check_geometry(env, indices),
+            *certificate.check_visibility(env, indices),
+            *certificate.check_accuracy(env, indices),
+        ]
+
+
+def is_reachable(goal: Goal) -> bool:
+    """Whether the flange can be at a goal within the joint ranges."""
+    from hvs_suite.cell.kinematics import kinematics
+
+    found = kinematics().goal_configurations_at_tool_angle(goal.position, goal.normal, 0.0)
+    return bool(len(found))

@@ -1,0 +1,389 @@
+"""Specs: every parameter that a task's name fixes, with its unit, as plain data.
+
+A `Spec` is made of parts (`Timing`, `Cameras`, `Disturbances`), which a family extends by its own
+fields. Parts are base classes, so that every parameter is a flat keyword of `hvs_suite.load`. This
+module imports neither MuJoCo nor torch: listing tasks is instant. Changing what a registered name
+means needs a new ``version``; ``tasks/lock.json`` holds the digests.
+"""
+
+import dataclasses
+import difflib
+import math
+import types
+import typing
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, cast
+
+from hvs_suite.errors import OptionError
+from hvs_suite.tasks.shared.metric import Metric
+
+if TYPE_CHECKING:
+    from hvs_suite.tasks.shared.scenario import Scenario
+
+Start = Literal["zero", "random", "fixed", "near_goal", "mixed"] | tuple[float, ...]
+ActionMode = Literal["joint_position", "joint_delta", "joint_velocity", "flange_twist"]
+RewardTerm = Literal[
+    "goal", "collision", "time", "position", "rotation", "joint_space", "exponential"
+]
+
+PRESETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "vision": ("eih", "eth", "joint_positions", "joint_velocities"),
+        "state": (
+            "joint_positions",
+            "joint_velocities",
+            "flange_position",
+            "goal_position",
+            "goal_normal",
+        ),
+    }
+)
+"""Observations by preset; ``state`` is privileged and never mixes with pictures."""
+VISION_OBSERVATIONS = (*PRESETS["vision"], "eih_depth", "eth_depth")
+JOINTS = 7
+JOINT_LIMITS_DEG = (170, 120, 170, 120, 170, 120, 175)
+MAX_RESOLUTION = 2048
+THESIS_REWARDS: tuple[RewardTerm, ...] = ("goal", "collision", "time", "position", "rotation")
+
+_SHAPES_SCENE = "shapes_scene"
+
+
+def scene[T](default: T) -> T:
+    """Declare a field that shapes the scene: another value draws other scenarios.
+
+    Fields without it (cameras switched off, rewards, tolerances) leave the scenarios as they are,
+    so that studies of them are paired.
+
+    Args:
+        default: The field's default.
+    """
+    return cast(T, dataclasses.field(default=default, metadata={_SHAPES_SCENE: True}))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Timing:
+    """When things happen.
+
+    Attributes:
+        control_period_s: Length of a control step (s).
+        time_limit_steps: Control steps after which the episode is truncated.
+        time_limit: ``soft`` truncates silently, ``hard`` also costs the goal reward r*.
+        hold_steps: Consecutive control-step ends inside tolerance that make a success.
+        latency_steps: Control steps between an action and its effect.
+        acceleration_limits: Let the cell's controller respect the published accelerations too.
+        discount: Discount while the episode goes on.
+    """
+
+    control_period_s: float = 0.1
+    time_limit_steps: int = 20
+    time_limit: Literal["soft", "hard"] = "soft"
+    hold_steps: int = 1
+    latency_steps: int = 0
+    acceleration_limits: bool = False
+    discount: float = 1.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Cameras:
+    """The eye in the hand (EIH) and the eye to hand (ETH), which looks on from above.
+
+    Attributes:
+        eih_resolution: Side of the square eye-in-hand image (px).
+        eth_resolution: Side of the square eye-to-hand image (px).
+        eih_channels: 3 for RGB, 1 for grey.
+        eth_channels: 3 for RGB, 1 for grey.
+        eih_fov_deg: Field of view of the eye-in-hand camera (deg).
+        eth_fov_deg: Field of view of the eye-to-hand camera (deg).
+        eth_position_m: Nominal position of the eye-to-hand camera (m, base frame).
+        eth_look_at_m: Point the nominal eye-to-hand camera looks at (m, base frame).
+        multisampling: Samples per pixel, 0 for none.
+    """
+
+    eih_resolution: int = 112
+    eth_resolution: int = 112
+    eih_channels: int = 3
+    eth_channels: int = 3
+    eih_fov_deg: float = 70.0
+    eth_fov_deg: float = 31.0
+    eth_position_m: tuple[float, float, float] = (-1.01, 0.76, 2.72)
+    eth_look_at_m: tuple[float, float, float] = (-0.064, 0.048, 0.0)
+    multisampling: int = 0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Disturbances:
+    """What differs from scenario to scenario besides the task itself.
+
+    Attributes:
+        vary_light: Draw the light's direction and brightness.
+        vary_colour: Draw the colours of surface, target and robot.
+        vary_texture: Draw a texture for the surface.
+        eth_position_noise_m: Standard deviation of the eye-to-hand position (m), cut at 2 sigma.
+        eth_rotation_noise_deg: Standard deviation of its orientation (deg), cut at 2 sigma.
+        image_noise: Standard deviation of pixel noise (grey levels of 255).
+        joint_offset_deg: Standard deviation of the encoder zero error (deg), cut at 2 sigma.
+    """
+
+    vary_light: bool = scene(False)
+    vary_colour: bool = scene(False)
+    vary_texture: bool = scene(False)
+    eth_position_noise_m: float = scene(0.0)
+    eth_rotation_noise_deg: float = scene(0.0)
+    image_noise: float = scene(0.0)
+    joint_offset_deg: float = scene(0.0)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Spec(Timing, Cameras, Disturbances):
+    """Every parameter of a task; families add their own.
+
+    Attributes:
+        name: Registered name, ``<family>-<variant>``.
+        version: Raised whenever the meaning of the name changes.
+        start: Joint angles at reset: all ``zero``; ``random`` in 80 % of the range, clear of
+            surface, self and goal; ``fixed``, one random start drawn once per split; ``near_goal``,
+            a few centimetres and degrees from the goal pose; ``mixed``, half the task's ``zero``
+            or ``random`` start, half ``near_goal``; or seven angles (rad).
+        observations: Preset, or names joined by ``+``: ``eih``, ``eth``, ``eih_depth``,
+            ``eth_depth``, ``joint_positions``, ``joint_velocities``.
+        normalise_observation: Images to [0, 1] and joints to [-1, 1], as in the thesis.
+        action_mode: Meaning of the seven (``flange_twist``: six) action numbers.
+        rewards: Reward terms that are switched on; never changes success or termination.
+    """
+
+    family: ClassVar[str]
+    """Name of the family, the first word of its tasks' names."""
+    keypoints: ClassVar[tuple[str, ...]] = ("target",)
+    """Points whose projections supervise eyes; `Family.keypoints` gives their places."""
+    plays_on: ClassVar[bool] = True
+    """Whether an episode can go on past its goal, to see where a policy settles."""
+
+    name: str
+    version: int = 1
+    start: Start = scene("zero")
+    observations: str = "vision"
+    normalise_observation: bool = False
+    action_mode: ActionMode = "joint_position"
+    rewards: tuple[RewardTerm, ...] = ("goal", "collision")
+
+    def __post_init__(self) -> None:
+        """Refuse values that make no sense, with a sentence; families add their own checks.
+
+        Raises:
+            OptionError: One of them does not.
+        """
+        _check_types(self)
+        observation_names(self.observations)
+        self._check_cameras()
+        self._check_timing()
+        if isinstance(self.start, tuple):
+            _check_joints(self.start)
+        self._check(
+            "cannot be negative",
+            lambda value: value >= 0,
+            "eth_position_noise_m",
+            "eth_rotation_noise_deg",
+            "image_noise",
+            "joint_offset_deg",
+        )
+
+    def _check_cameras(self) -> None:
+        for name in ("eih_resolution", "eth_resolution"):
+            side = getattr(self, name)
+            if not 8 <= side <= MAX_RESOLUTION:
+                raise OptionError(f"{name} is {side} px; use 8 to {MAX_RESOLUTION}")
+        for name in ("eih_channels", "eth_channels"):
+            if getattr(self, name) not in (1, 3):
+                raise OptionError(f"{name} is {getattr(self, name)}; use 3 (RGB) or 1 (grey)")
+        for name in ("eih_fov_deg", "eth_fov_deg"):
+            if not 1.0 <= getattr(self, name) <= 150.0:
+                raise OptionError(f"{name} is {getattr(self, name)} deg; use 1 to 150")
+        if self.multisampling not in (0, 2, 4, 8):
+            raise OptionError(f"multisampling is {self.multisampling}; use 0, 2, 4 or 8")
+        if self.eth_position_m[:2] == self.eth_look_at_m[:2]:
+            raise OptionError("eth_position_m lies straight above eth_look_at_m; shift one of them")
+
+    def _check_timing(self) -> None:
+        self._check("must be positive", lambda value: value > 0, "control_period_s")
+        for name in ("hold_steps", "time_limit_steps"):
+            if getattr(self, name) < 1:
+                raise OptionError(f"{name} is {getattr(self, name)}; use a whole number from 1 up")
+        if not 0 <= self.latency_steps < self.time_limit_steps:
+            raise OptionError(
+                f"latency_steps is {self.latency_steps}; use 0 or a few control steps"
+            )
+        if not 0.0 <= self.discount <= 1.0:
+            raise OptionError(f"discount is {self.discount}; use 0 to 1")
+
+    def _check(
+        self, rule: str, holds: typing.Callable[[float], bool], *names: str
+    ) -> None:
+        """Hold fields against a rule.
+
+        Args:
+            rule: In words, after "it ".
+            holds: The same as a function; False for NaN.
+            names: Of the fields.
+
+        Raises:
+            OptionError: A field breaks it.
+        """
+        for name in names:
+            value = getattr(self, name)
+            if not holds(value):
+                raise OptionError(f"{name} is {value}; it {rule}")
+
+    @property
+    def metrics(self) -> tuple[Metric, ...]:
+        """What is measured, in the order of a dataset's columns."""
+        raise NotImplementedError
+
+    @property
+    def tolerances(self) -> dict[str, float]:
+        """Bounds of the metrics that decide success, by name, in the metric's unit.
+
+        Where a figure of the whole episode is bounded it decides; elsewhere what is measured at the
+        end of each control step does.
+        """
+        bounded = [metric for metric in self.metrics if metric.bound is not None]
+        deciding = [metric for metric in bounded if metric.over == "episode"] or bounded
+        return {metric.name: metric.bound for metric in deciding if metric.bound is not None}
+
+    @property
+    def step_bounds(self) -> dict[str, float]:
+        """Bounds on what is measured at the end of a control step: inside them, it counts as held."""
+        return {
+            metric.name: metric.bound
+            for metric in self.metrics
+            if metric.over == "step" and metric.bound is not None
+        }
+
+    @property
+    def tightest_tolerance_mm(self) -> float:
+        """Smallest bound on a length at the end of a control step (mm)."""
+        units = {metric.name: metric.unit for metric in self.metrics}
+        return min(bound for name, bound in self.step_bounds.items() if units[name] == "mm")
+
+    def instruction(self, scenario: "Scenario | None" = None) -> str:
+        """The task as one sentence, identical in environment and dataset.
+
+        Args:
+            scenario: For tasks whose sentence depends on it; None for the sentence that fits all.
+        """
+        raise NotImplementedError
+
+    @property
+    def reach_m(self) -> float:
+        """Largest distance of a goal from the base's axis (m), which scales shaped rewards."""
+        return 0.78
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """Observations that are colour pictures, in order."""
+        return tuple(name for name in observation_names(self.observations) if name in CAMERA_NAMES)
+
+    @property
+    def scene_fields(self) -> tuple[str, ...]:
+        """Names of the fields that shape the scene; see `scene`."""
+        return tuple(
+            field.name for field in dataclasses.fields(self) if field.metadata.get(_SHAPES_SCENE)
+        )
+
+    def with_options(self, options: Mapping[str, Any]) -> Self:
+        """The spec with some parameters changed, for studies.
+
+        Args:
+            options: New values by field name; lists, as JSON gives them, become tuples.
+
+        Returns:
+            A new spec with the same name.
+
+        Raises:
+            OptionError: An option does not exist or its value makes no sense.
+        """
+        fields = {field.name for field in dataclasses.fields(self)} - {"name", "version"}
+        for name in options:
+            if name not in fields:
+                close = difflib.get_close_matches(name, sorted(fields), n=2)
+                hint = f"; did you mean {' or '.join(close)}?" if close else ""
+                raise OptionError(f"{self.name} has no option {name!r}{hint}")
+        values: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value
+            for name, value in options.items()
+        }
+        return dataclasses.replace(self, **values)
+
+
+CAMERA_NAMES = ("eih", "eth")
+
+
+def observation_names(observations: str) -> tuple[str, ...]:
+    """Names behind a preset or a list joined by ``+``.
+
+    Args:
+        observations: ``vision``, ``state``, or names such as ``eih+joint_positions``.
+
+    Returns:
+        Names in the order given.
+
+    Raises:
+        OptionError: A name is unknown or stands twice, or no camera is left.
+    """
+    if observations in PRESETS:
+        return PRESETS[observations]
+    names = tuple(observations.split("+"))
+    for name in names:
+        if name not in VISION_OBSERVATIONS:
+            raise OptionError(
+                f"unknown observation {name!r}; use {', '.join(PRESETS)}, or join some of "
+                f"{', '.join(VISION_OBSERVATIONS)} with '+'"
+            )
+    if len(set(names)) < len(names):
+        raise OptionError(f"observations {observations!r} name something twice")
+    if not any(name.startswith(("eih", "eth")) for name in names):
+        raise OptionError(
+            f"observations {observations!r} switch both cameras off; keep eih or eth, or use the "
+            "preset 'state'"
+        )
+    return names
+
+
+def _check_types(spec: Spec) -> None:
+    hints = typing.get_type_hints(type(spec))
+    for field in dataclasses.fields(spec):
+        value = getattr(spec, field.name)
+        hint = hints[field.name]
+        if not _fits(value, hint):
+            wanted = hint.__name__ if isinstance(hint, type) else str(hint).replace("typing.", "")
+            raise OptionError(f"{field.name} is {value!r}, which is not {wanted}")
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a value has a type, for the few kinds of types that variants use."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Literal:
+        return value in arguments
+    if origin in (typing.Union, types.UnionType):
+        return any(_fits(value, choice) for choice in arguments)
+    if origin is tuple:
+        if not isinstance(value, tuple):
+            return False
+        if arguments[-1] is Ellipsis:
+            return all(_fits(item, arguments[0]) for item in value)
+        return len(value) == len(arguments) and all(map(_fits, value, arguments))
+    if hint is float:
+        return (
+            isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        )
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    return isinstance(value, hint)
+
+
+def _check_joints(start: tuple[float, ...]) -> None:
+    if len(start) != JOINTS:
+        raise OptionError(f"start has {len(start)} angles; give one for each of {JOINTS} joints")
+    for i, (angle, limit) in enumerate(zip(start, JOINT_LIMITS_DEG, strict=True)):
+        if abs(math.degrees(angle)) > limit:
+            raise OptionError(f"start[{i}] is {angle} rad, beyond joint A{i + 1}'s {limit} deg")

@@ -1,0 +1,143 @@
+"""Starts: where the arm stands at reset, and how soon the goal can be reached from there."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from hvs_suite.cell.kinematics import kinematics, travel_time
+from hvs_suite.cell.robot import JOINT_NAMES, JOINT_RANGE_RAD
+from hvs_suite.errors import OptionError
+from hvs_suite.tasks.shared.goal import Goal
+from hvs_suite.tasks.shared.scenario import Streams
+from hvs_suite.tasks.shared.spec import Spec, Start
+
+FloatArray = npt.NDArray[np.float64]
+
+RANDOM_START_RANGE = 0.8
+START_CLEARANCE_M = 0.05
+START_GOAL_DISTANCE_M = 0.10
+SPARE_STEPS = 5
+# A start near the goal: joint deviations between a tenth of a degree and 14 degrees, log-uniform,
+# so that the last millimetres are met as often as the last decimetres.
+_NEAR_GOAL_SCALE_RAD = (0.002, 0.25)
+_NEAR_GOAL_CLEARANCE_M = 0.015
+MAX_REDRAWS = 1000
+
+Clearance = Callable[[FloatArray], float]
+"""Least distance (m) of the arm from the scene and itself at joint angles (7,) rad."""
+
+
+def draw_start(
+    spec: Spec, own: Start, streams: Streams, goal: Goal, floor_normal: FloatArray
+) -> FloatArray:
+    """Draw where the arm stands at reset.
+
+    Args:
+        spec: Parameters of the task.
+        own: The start of the named task, which ``mixed`` mixes with starts near the goal.
+        streams: Of the scenario.
+        goal: The first one.
+        floor_normal: Normal of the plane through the origin that the whole scene lies in or below.
+
+    Returns:
+        True joint angles, (7,) rad.
+
+    Raises:
+        OptionError: None can be drawn.
+    """
+    start = spec.start
+    if start == "mixed":
+        near = streams.generator("mixed").random() < 0.5
+        start = "near_goal" if near else own
+    if start == "zero":
+        return np.zeros(len(JOINT_NAMES))
+    if start == "random":
+        return _random_start(spec, streams, goal, floor_normal)
+    if start == "fixed":
+        return _fixed_start(streams, floor_normal)
+    if start == "near_goal":
+        return _near_goal_start(streams, goal)
+    return np.array(start, dtype=np.float64)
+
+
+def _fixed_start(streams: Streams, floor_normal: FloatArray) -> FloatArray:
+    # Kept for all goals, so it cannot depend on one: clear of surface and self is all it is.
+    random = streams.once("start-fixed")
+    bound = RANDOM_START_RANGE * JOINT_RANGE_RAD
+    for _ in range(MAX_REDRAWS):
+        q = random.uniform(-bound, bound)
+        if kinematics().clearance(q, 0.0, floor_normal) >= START_CLEARANCE_M:
+            return q
+    raise OptionError("no fixed start found that is clear of surface and self")
+
+
+def _random_start(
+    spec: Spec, streams: Streams, goal: Goal, floor_normal: FloatArray
+) -> FloatArray:
+    model = kinematics()
+    random = streams.generator("start")
+    bound = RANDOM_START_RANGE * JOINT_RANGE_RAD
+    steps = spec.time_limit_steps - SPARE_STEPS
+    for _ in range(MAX_REDRAWS):
+        q = random.uniform(-bound, bound)
+        if np.linalg.norm(model.flange_pose(q)[1] - goal.position) < START_GOAL_DISTANCE_M:
+            continue
+        if model.clearance(q, 0.0, floor_normal) < START_CLEARANCE_M:
+            continue
+        if steps_lower_bound(spec, q, goal) <= steps:
+            return q
+    raise OptionError(
+        f"no random start found for scenario {streams.index}: the goal at radius "
+        f"{math.hypot(*goal.position[:2]):.2f} m cannot be reached in {steps} steps"
+    )
+
+
+def _near_goal_start(streams: Streams, goal: Goal) -> FloatArray:
+    reachable = kinematics().goal_configurations_at_tool_angle(goal.position, goal.normal, 0.0)
+    if not len(reachable):
+        raise OptionError(
+            f"scenario {streams.index}: the goal {goal.position.round(3).tolist()} is out of reach"
+        )
+    random = streams.generator("near_goal")
+    # Any posture that faces the target, quick ones from the task's own start more often.
+    times = travel_time(np.zeros(len(JOINT_NAMES)), reachable, acceleration_limits=True)
+    best = reachable[np.argsort(times)[: max(1, len(reachable) // 8)]]
+    # No surface here bends up, so none rises above the plane that touches it at the target.
+    height = float(goal.target @ goal.normal / goal.normal[2])
+    for _ in range(MAX_REDRAWS):
+        posture = best[random.integers(len(best))].copy()
+        posture[6] = random.uniform(-1.0, 1.0) * 0.5
+        low, high = np.log(_NEAR_GOAL_SCALE_RAD)
+        scale = math.exp(random.uniform(low, high))
+        q = posture + random.normal(size=7) * scale * [0.5, 0.5, 0.5, 0.5, 1, 1, 2]
+        if (np.abs(q) < JOINT_RANGE_RAD).all() and (
+            kinematics().clearance(q, height, goal.normal) >= _NEAR_GOAL_CLEARANCE_M
+        ):
+            return q
+    raise OptionError(f"no start near the goal found for scenario {streams.index}")
+
+
+def steps_lower_bound(spec: Spec, start: FloatArray, goal: Goal) -> int:
+    """Least control steps to success from rest, under joint speed and acceleration limits.
+
+    The travel time over all goal configurations (yaw is free, so A7 stays), rounded up to control
+    steps, plus the further steps of the hold and the latency.
+
+    Args:
+        spec: Task whose period, hold and latency count.
+        start: Joint angles, (7,) rad.
+        goal: Where the flange has to be.
+
+    Returns:
+        Steps; a large number where the goal is out of reach.
+    """
+    configurations = kinematics().goal_configurations_at_tool_angle(
+        goal.position, goal.normal, float(start[6])
+    )
+    if not len(configurations):
+        return 10**6
+    seconds = float(travel_time(start, configurations, acceleration_limits=True).min())
+    steps = math.ceil(seconds / spec.control_period_s - 1e-9)
+    return max(1, steps) + spec.hold_steps - 1 + spec.latency_steps
