@@ -28,7 +28,7 @@ from hvs_suite.registry import load
 from hvs_suite.rollout import Policy
 
 if TYPE_CHECKING:
-    from hvs_suite.cell.environment import Environment, Moment
+    from hvs_suite.tasks.shared.environment import Environment, Moment
 
 NOISE_STREAM = "demonstration-noise"
 NOISE_TIME_S = 0.3
@@ -191,7 +191,7 @@ class _Perturbation:
 
     def apply(self, action: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """The action (7,) to execute instead; in [-1, 1]."""
-        distance = self._env.info["position_error_mm"] / 1000.0
+        distance = self._env.distance_m
         share = min(1.0, max(self._floor, distance / NOISE_FULL_DISTANCE_M))
         added = self._noise * share * self._state / JOINT_RANGE_RAD
         fresh = self._random.normal(size=len(JOINT_RANGE_RAD))

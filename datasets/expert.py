@@ -1,101 +1,26 @@
-"""The scripted expert: the fastest way to the goal from wherever the arm is, every control step.
+"""The scripted expert: it knows what is true, and plans every control step from it alone.
 
-It is privileged (it reads the true state and the goal), it keeps no memory of its own plan, and
-therefore answers the same for any policy that brought the arm to a state: what DAgger needs.
-
-A decision is:
-
-1. Predict the joints to the moment from which the action acts (variants with latency).
-2. Rank the goal's whole redundant family (elbow swivel, mirror shapes, free yaw) by the least
-   travel time from the present position and velocity under speed and acceleration limits.
-3. Take the first whose time-optimal motion (ruckig) keeps clear of surface and self.
-4. Command the point of that motion at the end of the control step, and a little further: the
-   arm trails its set point.
+It predicts the joints to the moment from which the action acts (tasks with latency) and commands
+what the planner answers. It keeps no memory, so it answers the same for any policy that brought the
+arm to a state: what DAgger needs.
 """
 
 from __future__ import annotations
 
-import collections.abc
-import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-import ruckig
 
 from hvs_suite.cell import robot
-from hvs_suite.cell.kinematics import Kinematics, kinematics
+from hvs_suite.datasets.planner import Planner
 from hvs_suite.errors import OptionError
+from hvs_suite.rollout import Observation
 
 if TYPE_CHECKING:
-    from hvs_suite.cell.environment import Environment
+    from hvs_suite.tasks.shared.environment import Environment
 
 FloatArray = npt.NDArray[np.float64]
-
-CLEARANCE_M = 0.010
-"""Distance that a motion keeps from the surface and between links (m)."""
-ESCAPE_HEIGHT_M = 0.15
-"""Where no way to the goal is clear, go above it first (m)."""
-N_SWIVEL = 360
-"""Elbow places in the ranked family; one degree apart costs under 10 ms of travel time."""
-PROJECTION_RANGE_M = 0.15
-"""Below this distance the nearest configuration of the goal is also computed exactly (m)."""
-TIE_BREAK_S = 0.01
-"""Price of unneeded motion: small against a control step, enough to make the choice unique."""
-
-LEAD_S = 0.025
-"""How far the set point runs ahead of the motion (s): a little less than the joints' lag, tuned for
-the fewest steps. More overshoots the goal, less arrives late."""
-
-_FULL_SPEED: FloatArray = robot.JOINT_SPEED_RAD_S[:6, None]
-_MAX_PATHS = 24
-_MAX_ESCAPES = 4
-_MAX_FLANGE_SPEED_M_S = 2.5
-_PATH_STEP_S = 0.02
-_DISTINCT_RAD = 0.2
-# Ruckig fails on some targets that braking reaches exactly; one beside them will do.
-_NUDGES_RAD = (0.0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3)
-_ITERATIONS = 8
-
-
-def stopping_travel_time(
-    q: FloatArray, velocity: FloatArray, goals: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Least time to come to rest at each goal from a moving start, joint by joint.
-
-    Per joint with x = distance along the direction s of the motion, u = s v the speed along it
-    (negative where the joint must first turn back), a and w its acceleration and speed limits:
-    peak speed p = sqrt(a x + u^2 / 2); t = (2 p - u) / a where p <= w, otherwise
-    t = (w - u) / a + w / a + (x - (2 w^2 - u^2) / (2 a)) / w. s is the sign of the way that is
-    left after braking as hard as possible.
-
-    Args:
-        q: Angles (n,) of the first n joints in rad.
-        velocity: Their velocities (n,) in rad/s.
-        goals: Goal configurations (m, n) in rad.
-
-    Returns:
-        Time of the slowest joint (m,) in s, and the sum over joints of (distance / speed)^2 (m,)
-        in s^2.
-    """
-    return _stopping_travel_time(q, velocity, np.ascontiguousarray(goals.T))
-
-
-def _stopping_travel_time(
-    q: FloatArray, velocity: FloatArray, goals: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """``stopping_travel_time`` for goals (n, m), joint by joint along the first axis."""
-    a = robot.JOINT_ACCELERATION_RAD_S2[: len(q), None]
-    w = robot.JOINT_SPEED_RAD_S[: len(q), None]
-    way = goals - q[:, None]
-    v = np.minimum(np.maximum(velocity[:, None], -w), w)
-    side = np.where(way >= v * np.abs(v) / (2.0 * a), 1.0, -1.0)
-    x, u = side * way, side * v
-    peak = np.sqrt(np.maximum(a * x + 0.5 * v**2, 0.0))
-    bang_bang = (2.0 * peak - u) / a
-    cruising = (2.0 * w - u) / a + (x - (2.0 * w**2 - v**2) / (2.0 * a)) / w
-    times = np.where(peak <= w, bang_bang, cruising)
-    return times.max(axis=0), ((way / w) ** 2).sum(axis=0)
 
 
 class Expert:
@@ -103,301 +28,58 @@ class Expert:
 
     Follows :class:`hvs_suite.rollout.Policy`; the observation is not looked at.
 
-    Attributes:
-        n_swivel: Elbow places that it chooses from, around the line from shoulder to wrist.
+    Args:
+        env: Where it acts.
+        plain: As in `Planner`.
+
+    Raises:
+        OptionError: The environment's action mode is not ``joint_position``.
     """
 
-    n_swivel = N_SWIVEL
-
-    def __init__(self, env: Environment) -> None:
-        """Attaches the expert to an environment.
-
-        Raises:
-            OptionError: The environment's action mode is not ``joint_position``.
-        """
-        if env.variant.action_mode != "joint_position":
+    def __init__(self, env: Environment, *, plain: bool = False) -> None:
+        spec = env.variant
+        if spec.action_mode != "joint_position":
             raise OptionError(
-                f"The expert commands joint positions, not {env.variant.action_mode}: load the "
+                f"The expert commands joint positions, not {spec.action_mode}: load the "
                 "task with action_mode='joint_position'."
             )
         self._env = env
-        self._kinematics: Kinematics = kinematics()
-        self._period_s = env.variant.control_period_s
-        self._goal_key: bytes = b""
-        self._family: FloatArray = np.empty((7, 1))
-        """The goal's configurations, one a column; the last is kept free."""
-        self._across: FloatArray = np.empty((2, 3))
-        """Two directions along the goal's surface, (2, 3)."""
-        self._floor_m = 0.0
-        self._clearance_m = 0.0
-        """Of the present state."""
-        self._soonest_s = math.inf
-        """What the soonest way to the goal took a control step ago (s)."""
-        self._ruckig = ruckig.Ruckig(7)
-        self._input = ruckig.InputParameter(7)
-        self._input.max_velocity = list(robot.JOINT_SPEED_RAD_S)
-        self._input.max_acceleration = list(robot.JOINT_ACCELERATION_RAD_S2)
-        # No jerk limit: within a control step the cell's set point moves at constant speed, so a
-        # ramp that is shorter than the step cannot be executed, and a longer one costs time.
+        self._planner = Planner(spec.control_period_s, plain=plain)
+        self._period_s = spec.control_period_s
+        self._delay_s = spec.latency_steps * spec.control_period_s
 
     def reset(self) -> None:
         """Nothing to forget: every decision stands on the present state alone."""
 
-    def select_action(
-        self, observation: collections.abc.Mapping[str, npt.NDArray[np.generic]]
-    ) -> npt.NDArray[np.float32]:
+    def select_action(self, observation: Observation) -> npt.NDArray[np.float32]:
         """The expert's action (7,) in [-1, 1] for the environment's present state."""
         return self.label()
 
     def label(self) -> npt.NDArray[np.float32]:
         """The expert's action (7,) in [-1, 1] for the environment's present state."""
-        truth = self._truth()
-        position, normal = truth["goal_position"], truth["goal_normal"]
-        self._remember_goal(position, normal)
-        # Distances are to a level plane. Elsewhere than on a flat surface that is the target's
-        # height, which is right near the goal and a guess far from it.
-        level = self._env.variant.surface == "flat"
-        self._floor_m = 0.0 if level else float(truth["target_position"][2]) - CLEARANCE_M
-        q, velocity = self._state_when_action_acts()
-        self._clearance_m = self._kinematics.clearance(q, self._floor_m)
-        target = self._next_set_point(q, velocity, position, normal)
-        return np.asarray(self._env.commandable(target), dtype=np.float32)
-
-    def _truth(self) -> collections.abc.Mapping[str, FloatArray]:
-        """What the expert knows of the goal, keys as in ``Align.privileged``."""
-        return self._env.privileged()
-
-    def _remember_goal(self, position: FloatArray, normal: FloatArray) -> None:
-        """Computes the goal's family of configurations once a goal."""
-        key = position.tobytes() + normal.tobytes()
-        if key != self._goal_key:
-            self._goal_key = key
-            self._soonest_s = math.inf
-            self._across = np.linalg.svd(normal[None])[2][1:]
-            family = self._kinematics.goal_configurations_at_tool_angle(
-                position, normal, tool_angle=0.0, n_swivel=self.n_swivel
-            )
-            self._family = np.empty((7, len(family) + 1))
-            self._family[:, :-1] = family.T
-
-    def _state_when_action_acts(self) -> tuple[FloatArray, FloatArray]:
-        """True joint angles and velocities (7,), (7,) at the moment the action takes effect.
-
-        The set points still queued move the arm first.
-        """
         env = self._env
-        q, velocity, _ = robot.after_commands(
+        # The set points still queued move the arm before the action takes effect.
+        q, velocity, set_point = robot.after_commands(
             env.joint_positions,
             env.joint_velocities,
             env.setpoint,
             env.pending_setpoints,
             self._period_s,
         )
-        return q, velocity
+        target = self._next_set_point(q, velocity, set_point)
+        return np.asarray(env.commandable(target), dtype=np.float32)
 
     def _next_set_point(
-        self, q: FloatArray, velocity: FloatArray, position: FloatArray, normal: FloatArray
+        self, q: FloatArray, velocity: FloatArray, set_point: FloatArray
     ) -> FloatArray:
-        """Where the set point (7,) shall be at the end of the control step."""
-        family = self._reachable(q, velocity, position, normal)
-        if len(family) == 0:
-            return q  # Out of reach: stand still.
-        required = min(CLEARANCE_M, self._clearance_m - 1e-3)
-        candidates = self._in_order(q, velocity, family)
-        motion = self._first_clear(q, velocity, candidates, required)
-        if motion is None:
-            motion = self._escape(q, velocity, position, normal, required)
-        return self._point_ahead(motion)
-
-    def _in_order(
-        self, q: FloatArray, velocity: FloatArray, family: FloatArray
-    ) -> collections.abc.Iterator[FloatArray]:
-        """Goal configurations (7,) of a family (m, 7), the one reached soonest first.
-
-        The first is nearly always clear, so it is found without timing all: none is reached sooner
-        than at full speed, and as a rule the soonest is no farther away than it was a control step
-        ago. Where that fails all are timed, so the answer does not depend on the last one.
-        """
-        # Joint by joint along the first axis: NumPy is slow over rows of seven.
-        joints = family[:, :6].T
-
-        def price(goals: FloatArray) -> FloatArray:
-            times, effort = _stopping_travel_time(q[:6], velocity[:6], goals)
-            return times + TIE_BREAK_S * effort
-
-        bound = (np.abs(joints - q[:6, None]) / _FULL_SPEED).max(axis=0)
-        [listed] = np.nonzero(bound <= self._soonest_s)
-        prices = price(joints.take(listed, axis=1))
-        if len(listed) == 0 or prices.min() > self._soonest_s:
-            listed, prices = np.arange(len(family)), price(joints)
-        least = int(prices.argmin())
-        # A little slack, because bounds and prices are rounded.
-        self._soonest_s, first = float(prices[least]) + 1e-9, int(listed[least])
-        yield family[first]
-        for column in np.argsort(price(joints), kind="stable").tolist():
-            if column != first:
-                yield family[column]
-
-    def _point_ahead(self, motion: ruckig.Trajectory) -> FloatArray:
-        """Where a motion is at the end of the control step (7,); the arm trails its set point."""
-        ahead = min(self._period_s + LEAD_S, motion.duration)
-        return np.asarray(motion.at_time(ahead)[0])
-
-    def _first_clear(
-        self,
-        q: FloatArray,
-        velocity: FloatArray,
-        candidates: collections.abc.Iterable[FloatArray],
-        required: float,
-    ) -> ruckig.Trajectory | None:
-        """The motion to the first candidate that keeps clear; skips what is near a blocked one."""
-        blocked: list[FloatArray] = []
-        for goal in candidates:
-            if any(np.abs(goal - other).max() < _DISTINCT_RAD for other in blocked):
-                continue
-            motion = self._motion(q, velocity, goal)
-            if self._least_clearance(motion, required) >= required:
-                return motion
-            blocked.append(goal)
-            if len(blocked) >= _MAX_PATHS:
-                break
-        return None
-
-    def _escape(
-        self,
-        q: FloatArray,
-        velocity: FloatArray,
-        position: FloatArray,
-        normal: FloatArray,
-        required: float,
-    ) -> ruckig.Trajectory:
-        """A motion away from obstacles where all ways to the goal are blocked or too fast.
-
-        To a place above the goal, towards the upright posture, or braking, whichever keeps clear
-        first or else clearest; each joint as fast as it can.
-        """
-        above = self._kinematics.goal_configurations_at_tool_angle(
-            position + ESCAPE_HEIGHT_M * normal, normal, tool_angle=q[6], n_swivel=24
+        """Where the set point (7,) shall be at the end of the control step that acts next."""
+        env, delay_s = self._env, self._delay_s
+        goal = env.goal(delay_s)
+        if not goal.velocity.any():
+            return self._planner.next_set_point(q, velocity, goal)
+        return self._planner.follow(
+            q, velocity, set_point, lambda ahead_s: env.goal(delay_s + ahead_s)
         )
-        rest = _where_braking_ends(q, velocity)
-        rest = np.clip(rest, -robot.JOINT_RANGE_RAD, robot.JOINT_RANGE_RAD)
-        upright = np.append(np.zeros(6), rest[6])
-        nearest = above[np.argsort(np.abs(above - rest).max(axis=1))[:_MAX_ESCAPES]]
-        best, clearest = -np.inf, self._motion(q, velocity, rest, together=False)
-        for target in (*nearest, upright, 0.5 * (rest + upright), rest):
-            motion = self._motion(q, velocity, target, together=False)
-            least = self._least_clearance(motion, -np.inf)
-            if least >= required:
-                return motion
-            if least > best:
-                best, clearest = least, motion
-        return clearest
-
-    def _reachable(
-        self, q: FloatArray, velocity: FloatArray, position: FloatArray, normal: FloatArray
-    ) -> FloatArray:
-        """Goal configurations (m, 7), in no order; good until it is asked again.
-
-        A7 alone turns the free yaw, so it is left where it comes to rest.
-        """
-        rest = _where_braking_ends(q, velocity)
-        nearest = self._nearest_goal(rest, position, normal)
-        family = self._family
-        if nearest is None:
-            family = family[:, :-1]
-        else:
-            family[:, -1] = nearest
-        family[6] = min(max(rest[6], -robot.JOINT_RANGE_RAD[6]), robot.JOINT_RANGE_RAD[6])
-        return family.T
-
-    def _nearest_goal(
-        self, rest: FloatArray, position: FloatArray, normal: FloatArray
-    ) -> FloatArray | None:
-        """The goal configuration (7,) nearest to where the arm comes to rest, by Gauss-Newton.
-
-        Distances are weighed by the accelerations, as travel times over short ways are. None far
-        from the goal, where the family's one-degree grid is as good, or outside the joint ranges.
-        """
-        a = robot.JOINT_ACCELERATION_RAD_S2
-        goal = rest
-        for iteration in range(_ITERATIONS):
-            R, flange = self._kinematics.flange_pose(goal)
-            away = position - flange
-            if iteration == 0 and math.hypot(*away.tolist()) > PROJECTION_RANGE_M:
-                return None
-            # Rotation vector that takes the flange axis onto the inward normal; yaw stays free.
-            across, turn = self._across, _cross(R[:, 2], -normal)
-            error = np.concatenate([away, across @ turn])
-            if np.abs(error).max() < 1e-9:
-                break
-            jacobian = self._kinematics.jacobian(goal)
-            weighted = np.concatenate([jacobian[:3], across @ jacobian[3:]]) * a
-            goal = goal + a * _least_solution(weighted, error)
-        else:
-            return None
-        if (np.abs(goal) > robot.JOINT_RANGE_RAD).any() or R[:, 2] @ normal > 0.0:
-            return None
-        return np.asarray(goal)
-
-    def _motion(
-        self, q: FloatArray, velocity: FloatArray, goal: FloatArray, *, together: bool = True
-    ) -> ruckig.Trajectory:
-        """The time-optimal motion to rest at a goal, the joints arriving together or each alone."""
-        # Ruckig's root finding stumbles over distances at the limit of double precision.
-        ends = goal.tolist()
-        self._input.current_position = [
-            end if abs(angle - end) < 1e-9 else angle
-            for angle, end in zip(q.tolist(), ends, strict=True)
-        ]
-        self._input.current_velocity = [
-            0.0 if abs(speed) < 1e-9 else min(max(speed, -limit), limit)
-            for speed, limit in zip(velocity.tolist(), self._input.max_velocity, strict=True)
-        ]
-        self._input.synchronization = (
-            ruckig.Synchronization.Time if together else ruckig.Synchronization.No
-        )
-        trajectory = ruckig.Trajectory(7)
-        for nudge in _NUDGES_RAD:
-            self._input.target_position = [end + nudge for end in ends]
-            try:
-                self._ruckig.calculate(self._input, trajectory)
-            except ruckig.RuckigError:
-                continue
-            return trajectory
-        raise RuntimeError(f"ruckig finds no motion from {q} at {velocity} to {goal}")
-
-    def _least_clearance(self, motion: ruckig.Trajectory, required: float) -> float:
-        """Least clearance (m) along a motion from the present state.
-
-        Stops looking once it falls below ``required``.
-        Steps as far as the arm can get within the distance found (conservative advancement).
-        """
-        least = clearance = self._clearance_m
-        t = 0.0
-        while least >= required and t < motion.duration:
-            t += max(_PATH_STEP_S, (clearance - CLEARANCE_M) / _MAX_FLANGE_SPEED_M_S)
-            q = motion.at_time(min(t, motion.duration))[0]
-            clearance = self._kinematics.clearance(q, self._floor_m)
-            least = min(least, clearance)
-        return least
-
-
-def _where_braking_ends(q: FloatArray, velocity: FloatArray) -> FloatArray:
-    """Where each joint comes to rest (7,) if it brakes as hard as it can."""
-    return q + velocity * np.abs(velocity) / (2.0 * robot.JOINT_ACCELERATION_RAD_S2)
-
-
-def _least_solution(A: FloatArray, b: FloatArray) -> FloatArray:
-    """The least x with A x = b as near as can be, leaving out directions that hardly count."""
-    u, s, vt = np.linalg.svd(A, full_matrices=False)
-    # ``np.linalg.pinv`` spends more on its checks than on its work.
-    return np.asarray(np.where(s > 1e-3 * s[0], (b @ u) / s, 0.0) @ vt)
-
-
-def _cross(one: FloatArray, two: FloatArray) -> FloatArray:
-    """Vector product (3,) of two vectors (3,); NumPy's is slow on so few numbers."""
-    (a, b, c), (x, y, z) = one.tolist(), two.tolist()
-    return np.array([b * z - c * y, c * x - a * z, a * y - b * x])
 
 
 def make_expert(env: Environment) -> Expert:

@@ -12,9 +12,11 @@ feature                                   dtype, shape    meaning
 ``privileged.scenario``                   int64 (1,)      index in the split
 ``privileged.goal_position``              float32 (3,)    of the flange at the goal (m, base frame)
 ``privileged.goal_normal``                float32 (3,)    outward surface normal there
-``privileged.target_eih``, ``.target_eth``  float32 (4,)  target in the image: u, v, diameter, seen
-``privileged.errors``                     float32 (4,)    at this frame: mm, mm, mm, deg
+``privileged.<keypoint>_<camera>``        float32 (4,)    in the image: u, v, diameter, seen
+``privileged.errors``                     float32 (k,)    the task's metrics at this frame
 ========================================  ==============  ========================================
+
+Which keypoints, metrics and further privileged columns there are, the task's spec declares.
 """
 
 from collections.abc import Mapping
@@ -30,14 +32,13 @@ ROBOT_TYPE = "kuka_lbr_iiwa"
 # Spelled out rather than imported: robot.py loads MuJoCo, and reading a dataset must not.
 JOINT_NAMES = ("A1", "A2", "A3", "A4", "A5", "A6", "A7")
 CAMERAS = ("eih", "eth")
-ERROR_NAMES = ("position_error_mm", "lateral_error_mm", "height_error_mm", "tilt_error_deg")
-PRIVILEGED_VECTORS = ("goal_position", "goal_normal", "target_eih", "target_eth")
 
 STATE = "observation.state"
 ACTION = "action"
-ACTION_EXECUTED = "privileged.action_executed"
-SCENARIO = "privileged.scenario"
-ERRORS = "privileged.errors"
+PRIVILEGED = "privileged."
+ACTION_EXECUTED = f"{PRIVILEGED}action_executed"
+SCENARIO = f"{PRIVILEGED}scenario"
+ERRORS = f"{PRIVILEGED}errors"
 
 _STATE_SUFFIX = {"joint_positions": "pos", "joint_velocities": "vel"}
 
@@ -86,11 +87,9 @@ def dataset_features(variant: Spec) -> dict[str, dict[str, Any]]:
     features["next.success"] = _scalar("bool", "success")
     features[ACTION_EXECUTED] = _vector([f"{joint}.pos" for joint in JOINT_NAMES])
     features[SCENARIO] = _scalar("int64", "scenario")
-    features["privileged.goal_position"] = _vector(["x", "y", "z"])
-    features["privileged.goal_normal"] = _vector(["x", "y", "z"])
-    for camera in CAMERAS:
-        features[f"privileged.target_{camera}"] = _vector(["u", "v", "diameter", "visible"])
-    features[ERRORS] = _vector(list(ERROR_NAMES))
+    for name, dimensions in variant.privileged.items():
+        features[f"{PRIVILEGED}{name}"] = _vector(list(dimensions))
+    features[ERRORS] = _vector([metric.name for metric in variant.metrics])
     return features
 
 
@@ -109,9 +108,10 @@ def observed_part(
     if names:
         frame[STATE] = np.concatenate([observation[name] for name in names]).astype(np.float32)
     truth, info = environment.privileged(), environment.info
-    for name in PRIVILEGED_VECTORS:
-        frame[f"privileged.{name}"] = truth[name].astype(np.float32)
-    frame[ERRORS] = np.array([info[name] for name in ERROR_NAMES], np.float32)
+    for name in variant.privileged:
+        frame[f"{PRIVILEGED}{name}"] = truth[name].astype(np.float32)
+    errors = [info["errors"][metric.name] for metric in variant.metrics]
+    frame[ERRORS] = np.array(errors, np.float32)
     frame[SCENARIO] = np.array([info["scenario"]], np.int64)
     return frame
 

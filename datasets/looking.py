@@ -10,53 +10,48 @@ centimetres where the target is. Who goes there at once ends up beside it, too l
 the hand to see it. So until the eye in the hand has seen the target, the demonstrator heads for a
 place above it, from which it will.
 
-And where the arm may start anywhere, it goes there in one of two postures, the elbow straight above
-the line from shoulder to wrist, A1 towards the target or away from it: the one whose slowest joint
-arrives first at full speed. The expert chooses the soonest of some two thousand, and which that is
-jumps with every little change of where the arm stands: nobody could learn it
-(docs/experiments/simple-ways.md). Two postures cost three steps.
+And where the arm may start anywhere, it goes there in one of two plain postures (see
+`hvs_suite.datasets.planner.Planner`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import dataclasses
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from hvs_suite.cell.robot import JOINT_SPEED_RAD_S
-from hvs_suite.datasets.expert import CLEARANCE_M, Expert
+from hvs_suite.datasets.expert import Expert
 from hvs_suite.registry import TASKS
+from hvs_suite.tasks.shared.goal import Goal
+from hvs_suite.tasks.shared.spec import CAMERA_NAMES
 
 if TYPE_CHECKING:
-    from hvs_suite.cell.environment import Environment
+    from hvs_suite.tasks.shared.environment import Environment
 
 FloatArray = npt.NDArray[np.float64]
 
 LOOK_OUT_RAD: FloatArray = np.array([1.75, 0.8, 0.0, -0.6, 0.0, 0.6, 0.0])
 """Where the arm goes to look (rad), chosen for the fewest steps (docs/experiments/look-out.md)."""
-
-
-PLAIN_SWIVELS = 1
-"""The elbow straight above: two postures within reach, as a rule."""
 LOOK_DOWN_M = 0.15
 """How far above the goal the eye in the hand looks for the target (m): high enough to have it in
 view wherever the eye-to-hand camera may take it to be, and hardly a detour."""
 
 
 class Demonstrator(Expert):
-    """Answers with the action that a policy should learn; one episode at a time."""
+    """Answers with the action that a policy should learn; one episode at a time.
+
+    Args:
+        env: Where it acts.
+    """
 
     def __init__(self, env: Environment) -> None:
-        super().__init__(env)
-        variant = env.variant
-        named = TASKS.get(variant.name)
-        starts = {variant.start, named.start if named is not None else variant.start}
-        self._is_plain = "random" in starts
-        if self._is_plain:
-            self.n_swivel = PLAIN_SWIVELS
-        self._looks_down = variant.eth_position_noise_m > 0 or variant.eth_rotation_noise_deg > 0
+        spec = env.variant
+        named = TASKS.get(spec.name)
+        starts = {spec.start, named.start if named is not None else spec.start}
+        super().__init__(env, plain="random" in starts)
+        self._looks_down = spec.eth_position_noise_m > 0 or spec.eth_rotation_noise_deg > 0
         self.reset()
 
     def reset(self) -> None:
@@ -64,46 +59,30 @@ class Demonstrator(Expert):
         self._has_seen = False
         self._has_seen_closely = not self._looks_down
 
-    def _truth(self) -> Mapping[str, FloatArray]:
-        if self._has_seen and self._has_seen_closely:
-            # Looking for the target in both pictures takes the most of ``privileged``.
-            scenario = self._env.scenario
-            return {
-                "goal_position": self._env.task.goal,
-                "goal_normal": scenario.normal,
-                "target_position": scenario.target,
-            }
-        truth = self._env.privileged()
-        in_hand, afar = (truth[name][3] > 0.5 for name in ("target_eih", "target_eth"))
-        self._has_seen = self._has_seen or bool(in_hand or afar)
-        self._has_seen_closely = self._has_seen_closely or bool(in_hand)
-        if not self._has_seen_closely:
-            raised = truth["goal_position"] + LOOK_DOWN_M * truth["goal_normal"]
-            return {**truth, "goal_position": raised}
-        return truth
-
-    def _in_order(
-        self, q: FloatArray, velocity: FloatArray, family: FloatArray
-    ) -> Iterator[FloatArray]:
-        if not self._is_plain:
-            return super()._in_order(q, velocity, family)
-        times = (np.abs(family - q) / JOINT_SPEED_RAD_S)[:, :6].max(axis=1)
-        return iter(family[np.argsort(times, kind="stable")])
-
-    def _nearest_goal(
-        self, rest: FloatArray, position: FloatArray, normal: FloatArray
-    ) -> FloatArray | None:
-        # Beside the two, it would be another goal for every place that the arm comes from.
-        return None if self._is_plain else super()._nearest_goal(rest, position, normal)
-
     def _next_set_point(
-        self, q: FloatArray, velocity: FloatArray, position: FloatArray, normal: FloatArray
+        self, q: FloatArray, velocity: FloatArray, set_point: FloatArray
     ) -> FloatArray:
+        if not (self._has_seen and self._has_seen_closely):
+            self._look()
         if not self._has_seen:
-            motion = self._motion(q, velocity, LOOK_OUT_RAD, together=False)
-            if self._least_clearance(motion, CLEARANCE_M) >= CLEARANCE_M:
-                return self._point_ahead(motion)
-        return super()._next_set_point(q, velocity, position, normal)
+            ahead = self._planner.towards_posture(q, velocity, LOOK_OUT_RAD)
+            if ahead is not None:
+                return ahead
+        if not self._has_seen_closely:
+            return self._planner.next_set_point(q, velocity, _raised(self._env.goal()))
+        return super()._next_set_point(q, velocity, set_point)
+
+    def _look(self) -> None:
+        """Notice whether a camera has the target in view."""
+        truth, [target, *_] = self._env.privileged(), self._env.variant.keypoints
+        seen = {name: truth[f"{target}_{name}"][3] > 0.5 for name in CAMERA_NAMES}
+        self._has_seen = self._has_seen or any(seen.values())
+        self._has_seen_closely = self._has_seen_closely or bool(seen["eih"])
+
+
+def _raised(goal: Goal) -> Goal:
+    """The place above a goal from which the eye in the hand looks down on it."""
+    return dataclasses.replace(goal, standoff_m=goal.standoff_m + LOOK_DOWN_M)
 
 
 def make_demonstrator(env: Environment) -> Demonstrator:

@@ -24,8 +24,8 @@ class DatasetMetadata:
         options: Options of the task that differ from the named one.
         noise: Standard deviation of the perturbation of executed actions, far from the goal (rad).
         command: What recorded it, for people.
-        task_digest: What the task's name meant then, as ``hvs_suite.tasks.shared.lock`` says it; empty in
-            datasets from before it was kept.
+        task_digest: What the task's name meant then, as ``hvs_suite.tasks.shared.lock`` says it;
+            empty in datasets from before it was kept.
         format: Version of this file.
     """
 

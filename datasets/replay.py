@@ -18,7 +18,6 @@ from hvs_suite.datasets import reader
 from hvs_suite.datasets.features import (
     ACTION_EXECUTED,
     CAMERAS,
-    ERROR_NAMES,
     ERRORS,
     SCENARIO,
     image_key,
@@ -107,7 +106,7 @@ def replay(root: Path, episode: int) -> Replay:
                 )
             time_step = env.step(action)
             cells.append(env.render(width=CELL_SIDE, height=CELL_SIDE))
-        at_end = [float(env.info[name]) for name in ERROR_NAMES]
+        at_end = [env.info["errors"][metric.name] for metric in variant.metrics]
         for camera, shown in pictures.items():
             shown.append(as_rgb(time_step.observation[camera]))
     errors = np.vstack([errors, at_end])
@@ -184,11 +183,11 @@ def _frame(
 
 
 def _curves(variant: "Spec", errors: npt.NDArray[Any], step: int) -> Picture:
-    """Position and tilt error over the steps, bold up to now, with the tolerances.
+    """Lengths and angles over the steps, bold up to now, with the tolerances.
 
     Args:
         variant: Whose tolerances are drawn.
-        errors: (steps + 1, 4) as ``ERROR_NAMES``.
+        errors: (steps + 1, k), the metrics of the task.
         step: Now.
 
     Returns:
@@ -197,21 +196,19 @@ def _curves(variant: "Spec", errors: npt.NDArray[Any], step: int) -> Picture:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(WIDTH / DPI, CURVES_HEIGHT / DPI), dpi=DPI, facecolor=_hex(PAPER))
-    left, right = figure.subplots(1, 2)
     figure.subplots_adjust(left=0.075, right=0.982, bottom=0.2, top=0.88, wspace=0.2)
-    lines: list[tuple[str, int, float | None]]
-    if variant.position_tolerance_mm is not None:
-        lines = [("position", 0, variant.position_tolerance_mm)]
-    else:
-        lines = [
-            ("sideways", 1, variant.lateral_tolerance_mm),
-            ("height", 2, variant.height_tolerance_mm),
-        ]
-    _plot(left, "position error (mm)", lines, errors, step)
-    _plot(right, "tilt error (deg)", [("tilt", 3, variant.tilt_tolerance_deg)], errors, step)
-    drawn = io.BytesIO()
-    figure.savefig(drawn, format="rgba", dpi=DPI)
-    pixels = np.frombuffer(drawn.getvalue(), np.uint8)
+    lines: dict[str, list[tuple[str, int, float | None]]] = {}
+    for index, metric in enumerate(variant.metrics):
+        if metric.bound is not None and metric.over == "step":
+            line = (metric.title.removesuffix(" error"), index, metric.bound)
+            lines.setdefault(metric.unit, []).append(line)
+    for axes, (unit, drawn) in zip(
+        np.ravel(figure.subplots(1, len(lines))), lines.items(), strict=True
+    ):
+        _plot(axes, f"error ({unit})", drawn, errors, step)
+    picture = io.BytesIO()
+    figure.savefig(picture, format="rgba", dpi=DPI)
+    pixels = np.frombuffer(picture.getvalue(), np.uint8)
     return pixels.reshape(CURVES_HEIGHT, WIDTH, 4)[..., :3].copy()
 
 

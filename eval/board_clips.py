@@ -29,7 +29,7 @@ from hvs_suite.rollout import Action, Observation
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-    from hvs_suite.cell.environment import Environment
+    from hvs_suite.tasks.shared.environment import Environment
 
 FOLDER: Final = "clips"
 Kind = Literal["success", "failure"]

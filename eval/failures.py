@@ -26,8 +26,8 @@ from hvs_suite.rollout import Action, Observation, one_torch_thread
 from hvs_suite.tasks.shared.spec import Spec
 
 if TYPE_CHECKING:
-    from hvs_suite.cell.environment import Environment
     from hvs_suite.policies.hvs.network import HvsNetwork
+    from hvs_suite.tasks.shared.environment import Environment
 
 # An error that falls by a fifth in so many steps is on its way to the goal.
 _LAST_STEPS = 3

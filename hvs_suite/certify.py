@@ -16,6 +16,7 @@ import numpy as np
 import hvs_suite
 from hvs_suite.datasets.expert import make_expert
 from hvs_suite.files import replacing
+from hvs_suite.registry import family_of, make_task
 from hvs_suite.rollout import rollout
 from hvs_suite.tasks.shared import certificate, lock
 from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
@@ -33,7 +34,7 @@ def certify(task: str, scenarios: int, workers: int) -> certificate.Certificate:
     """
     indices = range(scenarios)
     with hvs_suite.load(task, split=TEST_SPLIT) as env:
-        checks = certificate.certify(env, indices)
+        checks = family_of(task).certify(env, indices)
     episodes = rollout(
         functools.partial(hvs_suite.load, task, split=TEST_SPLIT, observations="state"),
         make_expert,
@@ -60,7 +61,7 @@ def main() -> int:
     arguments = parser.parse_args()
     names = arguments.tasks or list(hvs_suite.TASKS)
     entries = {
-        name: dataclasses.asdict(lock.compute_entry(variant))
+        name: dataclasses.asdict(lock.compute_entry(variant, make_task(variant, TEST_SPLIT).source))
         for name, variant in hvs_suite.TASKS.items()
     }
     with replacing(TASKS_FOLDER / "lock.json") as path:

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
     from PIL.ImageFont import FreeTypeFont
 
-    from hvs_suite.cell.environment import Environment
     from hvs_suite.rollout import Action, Episode, Observation, Policy
+    from hvs_suite.tasks.shared.environment import Environment
     from hvs_suite.tasks.shared.spec import Spec
 
 Picture = npt.NDArray[np.uint8]
@@ -273,15 +273,12 @@ def _draw_standing(
     rows: list[tuple[str, str, bool | None]] = [
         ("step", f"{info['steps']} of {variant.time_limit_steps}", None)
     ]
-    for key, label, bound, unit in (
-        ("position_error_mm", "position", variant.position_tolerance_mm, " mm"),
-        ("lateral_error_mm", "sideways", variant.lateral_tolerance_mm, " mm"),
-        ("height_error_mm", "height", variant.height_tolerance_mm, " mm"),
-        ("tilt_error_deg", "tilt", variant.tilt_tolerance_deg, "°"),
-    ):
-        if bound is not None:
-            error = abs(float(info[key]))
-            rows.append((label, f"{error:.2f}{unit}  (≤ {bound:g}{unit})", error <= bound))
+    for metric in variant.metrics:
+        if metric.bound is not None:
+            error = info["errors"][metric.name]
+            unit = "°" if metric.unit == "deg" else f" {metric.unit}".rstrip()
+            text = f"{error:.2f}{unit}  (≤ {metric.bound:g}{unit})"
+            rows.append((metric.title.removesuffix(" error"), text, error <= metric.bound))
     terms = ", ".join(f"{name} {value:+.2f}" for name, value in reward_terms.items() if value)
     rows.append(
         (

@@ -9,14 +9,16 @@ import functools
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-import hvs_suite.tasks.align  # noqa: F401 - registers its tasks
+import hvs_suite.tasks.align
+import hvs_suite.tasks.sequence
+import hvs_suite.tasks.track  # noqa: F401 - each registers its tasks
 from hvs_suite.errors import OptionError, UnknownTaskError
 from hvs_suite.tasks.shared import family
 from hvs_suite.tasks.shared.spec import Spec
 
 if TYPE_CHECKING:
-    from hvs_suite.cell.environment import Environment
     from hvs_suite.tasks.shared.arm_task import ArmTask
+    from hvs_suite.tasks.shared.environment import Environment
 
 
 class _Tasks(Mapping[str, Spec]):
@@ -108,7 +110,7 @@ def load(
     if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or seed < 0):
         raise OptionError(f"seed is {seed!r}; use a whole number from 0 up, or None")
     # MuJoCo takes half a second to import: listing tasks must not pay for it.
-    from hvs_suite.cell.environment import Environment
+    from hvs_suite.tasks.shared.environment import Environment
 
     return Environment(make_task(spec, split), seed=seed)
 

@@ -90,10 +90,7 @@ class Episode:
         steps: Control steps played.
         steps_to_goal: Control steps up to and including success; None for failures.
         n_clipped: Control steps whose action had a component outside the action bounds.
-        position_error_mm: Norm of lateral and height error at the end of the last step (mm).
-        lateral_error_mm: Error in the target plane (mm).
-        height_error_mm: Error along the surface normal (mm).
-        tilt_error_deg: Angle between flange axis and inward surface normal (deg).
+        errors: The task's metrics at the end of the last step, by name.
         actions: (steps, 7) float32, as the policy gave them, before clipping.
         decision_s: Wall time spent in `Policy.select_action`, summed over the episode (s).
     """
@@ -106,10 +103,7 @@ class Episode:
     steps: int
     steps_to_goal: int | None
     n_clipped: int
-    position_error_mm: float
-    lateral_error_mm: float
-    height_error_mm: float
-    tilt_error_deg: float
+    errors: Mapping[str, float]
     actions: npt.NDArray[np.float32]
     decision_s: float
 
@@ -164,10 +158,7 @@ def run_episode(
         steps=len(actions),
         steps_to_goal=len(actions) if success else None,
         n_clipped=n_clipped,
-        position_error_mm=float(info["position_error_mm"]),
-        lateral_error_mm=float(info["lateral_error_mm"]),
-        height_error_mm=float(info["height_error_mm"]),
-        tilt_error_deg=float(info["tilt_error_deg"]),
+        errors={name: float(value) for name, value in info["errors"].items()},
         actions=np.array(actions, dtype=np.float32).reshape(-1, *spec.shape),
         decision_s=decision_s,
     )

@@ -16,7 +16,7 @@ from hvs_suite.rollout import Action, Observation, Policy, one_torch_thread, run
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-    from hvs_suite.cell.environment import Environment
+    from hvs_suite.tasks.shared.environment import Environment
 
 COLUMNS = 6
 _TILE_PX = 200

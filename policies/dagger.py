@@ -28,7 +28,7 @@ from hvs_suite.policies.hvs.network import IMAGE_PREFIX
 from hvs_suite.rollout import Policy, play
 
 if TYPE_CHECKING:
-    from hvs_suite.cell.environment import Environment
+    from hvs_suite.tasks.shared.environment import Environment
 
 FIRST_SHARE = 0.35
 LAST_SHARE = 0.80

@@ -21,7 +21,7 @@ A decision is:
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -32,21 +32,22 @@ from hvs_suite.cell.robot import (
     BASE_TO_SHOULDER_M,
     ELBOW_TO_WRIST_M,
     JOINT_RANGE_RAD,
-    JOINT_SPEED_RAD_S,
     SHOULDER_TO_ELBOW_M,
     WRIST_TO_FLANGE_M,
+    after_commands,
     set_point_after,
 )
-from hvs_suite.datasets.expert import Expert
+from hvs_suite.datasets.planner import Planner
 from hvs_suite.errors import PolicyError
 from hvs_suite.policies.target_estimate import Sight, Sighting, TargetEstimate
 from hvs_suite.policies.target_search import SPACING_M, TargetSearch
 from hvs_suite.rollout import Observation
 from hvs_suite.tasks.shared.detection import find_discs
+from hvs_suite.tasks.shared.goal import Goal
 from hvs_suite.tasks.shared.spec import Spec, observation_names
 
 if TYPE_CHECKING:
-    from hvs_suite.cell.environment import Environment
+    pass
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -65,9 +66,6 @@ _REACH_MARGIN_M = 0.0005
 _SHORTEST_REACH_M = 0.402
 """Least distance of wrist and shoulder, A4 at its limit of 120 deg."""
 _LOOK_CHOICES = 12
-_N_DESCENT_SWIVEL = 36
-_DESCENT_SLACK_S = 0.2
-"""A hover whose way on takes this much longer than the shortest way on is not chosen."""
 
 
 class Playground(Protocol):
@@ -79,7 +77,7 @@ class Playground(Protocol):
 
 
 class Belief:
-    """The arm's state as the policy can know it; answers for an environment to the expert.
+    """The arm's state as the policy can know it.
 
     Set points are remembered rather than seen: they move towards each command within the joint
     speed limits. Whether commands act at once or a control step later shows in when the arm first
@@ -89,20 +87,16 @@ class Belief:
         variant: The task's parameters.
         joint_positions: Measured, (7,) rad.
         joint_velocities: Measured, (7,) rad/s.
-        descent: Where the flange goes next from the goal, (3,) m, where it only hovers there.
     """
 
     def __init__(self, variant: Spec) -> None:
         self.variant = variant
         self.joint_positions: FloatArray = np.zeros(7)
         self.joint_velocities: FloatArray = np.zeros(7)
-        self.descent: FloatArray | None = None
-        self._goal: FloatArray = np.zeros(3)
         self.reset()
 
     def reset(self) -> None:
         """Forget the last episode."""
-        self.descent = None
         self._start: FloatArray | None = None
         self._commands: list[FloatArray] = []
         self._latency = 0
@@ -123,14 +117,6 @@ class Belief:
             else:
                 self._latency = min(len(self._commands), _MAX_LATENCY)
 
-    def aim(self, goal: FloatArray, descent: FloatArray | None = None) -> None:
-        """Set the goal of the flange and, for a hover, where it goes next, (3,) m.
-
-        It faces straight down at both.
-        """
-        self._goal = goal
-        self.descent = descent
-
     def command(self, action: npt.NDArray[np.float32]) -> None:
         """Remember an action, (7,) in [-1, 1]."""
         self._commands.append(action.astype(np.float64) * JOINT_RANGE_RAD)
@@ -145,13 +131,15 @@ class Belief:
         """Set points commanded that do not act yet, oldest first."""
         return self._commands[len(self._commands) - self._latency :]
 
-    def privileged(self) -> dict[str, FloatArray]:
-        """The goal as believed: what the expert would read from the truth."""
-        return {"goal_position": self._goal, "goal_normal": _UP}
-
-    def commandable(self, q: npt.ArrayLike) -> npt.NDArray[np.float32]:
-        """The action (7,) float32 that sends the encoders to angles (7,) rad."""
-        return np.clip(np.asarray(q) / JOINT_RANGE_RAD, -1.0, 1.0).astype(np.float32)
+    def when_action_acts(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Joint angles (rad), speeds (rad/s) and set point (rad), (7,) each, at that moment."""
+        return after_commands(
+            self.joint_positions,
+            self.joint_velocities,
+            self.setpoint,
+            self.pending_setpoints,
+            self.variant.control_period_s,
+        )
 
     def _tracked(self, commands: list[FloatArray]) -> FloatArray:
         assert self._start is not None
@@ -159,37 +147,6 @@ class Belief:
         for command in commands:
             set_point = set_point_after(set_point, command, self.variant.control_period_s)
         return set_point
-
-
-class Mover(Expert):
-    """The expert's motion, which thinks one goal ahead while it hovers.
-
-    Args:
-        belief: What it knows of the arm.
-    """
-
-    def __init__(self, belief: Belief) -> None:
-        super().__init__(cast("Environment", belief))
-        self._belief = belief
-
-    def _reachable(
-        self, q: FloatArray, velocity: FloatArray, position: FloatArray, normal: FloatArray
-    ) -> FloatArray:
-        """Hover configurations (m, 7), in no order, that have a short way on."""
-        family = super()._reachable(q, velocity, position, normal)
-        if self._belief.descent is None or len(family) == 0:
-            return family
-        onward = self._kinematics.goal_configurations_at_tool_angle(
-            self._belief.descent, _UP, family[0, 6], n_swivel=_N_DESCENT_SWIVEL
-        )
-        if len(onward) == 0:
-            return family
-        seconds = np.zeros((len(family), len(onward)), np.float32)
-        for here, there, speed in zip(family.T, onward.T, JOINT_SPEED_RAD_S, strict=True):
-            way = np.subtract.outer(here.astype(np.float32), there.astype(np.float32))
-            np.maximum(seconds, np.abs(way) / np.float32(speed), out=seconds)
-        descent = seconds.min(axis=1)
-        return np.asarray(family[descent <= descent.min() + _DESCENT_SLACK_S])
 
 
 class Servo:
@@ -207,7 +164,7 @@ class Servo:
         self._variant = variant
         self._kinematics = kinematics()
         self._belief = Belief(variant)
-        self._mover = Mover(self._belief)
+        self._planner = Planner(variant.control_period_s)
         self._sight = Sight(variant.target_diameter_m, variant.ring_m)
         self._search = TargetSearch(self._kinematics, variant.ring_m, variant.target_diameter_m)
         names = observation_names(variant.observations)
@@ -244,8 +201,10 @@ class Servo:
         q = np.asarray(observation["joint_positions"], np.float64)
         self._belief.measure(q, np.asarray(observation["joint_velocities"], np.float64))
         self._perceive(observation, q)
-        self._aim(q)
-        action = self._mover.label()
+        goal, onward = self._aim(q)
+        angles, speeds, _ = self._belief.when_action_acts()
+        target = self._planner.next_set_point(angles, speeds, goal, onward=onward)
+        action = np.clip(target / JOINT_RANGE_RAD, -1.0, 1.0).astype(np.float32)
         self._belief.command(action)
         return action
 
@@ -303,11 +262,10 @@ class Servo:
 
     # --- going ----------------------------------------------------------------------------------
 
-    def _aim(self, q: FloatArray) -> None:
-        """Decide where the flange shall go."""
+    def _aim(self, q: FloatArray) -> tuple[Goal, Goal | None]:
+        """Decide where the flange shall go, and where it goes next if it only hovers there."""
         if not self._estimate.is_known:
-            self._belief.aim(self._look_out(q))
-            return
+            return _facing_down(self._look_out(q)), None
         place, sigma = self._estimate.place()
         standoff, surface = self._variant.standoff_m, self._estimate.surface_m
         # Misplaced by a few millimetres, a target at the edge would be out of reach.
@@ -318,10 +276,9 @@ class Servo:
             needed = radius / self._half_view
         height = max(standoff, needed) * (1.0 + 0.3 * self._misses)
         if height == standoff:
-            self._belief.aim(goal)
-            return
+            return _facing_down(goal), None
         hover = np.array([*place, min(height, _MAX_HOVER_M) + surface])
-        self._belief.aim(_within_reach(hover), descent=goal)
+        return _facing_down(_within_reach(hover)), _facing_down(goal)
 
     def _look_out(self, q: FloatArray) -> FloatArray:
         """Where to hover to look at what nobody has looked at, (3,) m.
@@ -354,6 +311,11 @@ def _near(points: FloatArray, place: FloatArray, radius: float) -> npt.NDArray[n
     """Which points (n, 3) lie within a radius (m) of a place, seen from above."""
     inner = max(radius - SPACING_M, SPACING_M)
     return np.asarray(np.hypot(*(points[:, :2] - place[:2]).T) < inner)
+
+
+def _facing_down(position: FloatArray) -> Goal:
+    """The goal of the flange at a place (3,) m over the table, facing straight down."""
+    return Goal(np.array([position[0], position[1], 0.0]), _UP, float(position[2]))
 
 
 def _within_reach(goal: FloatArray) -> FloatArray:

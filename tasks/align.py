@@ -16,7 +16,7 @@ import numpy.typing as npt
 from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared.family import register
 from hvs_suite.tasks.shared.goal import Goal
-from hvs_suite.tasks.shared.placing import Placing, PlacingSpec, is_reachable
+from hvs_suite.tasks.shared.placing import HARD, Placing, PlacingSpec, is_reachable
 from hvs_suite.tasks.shared.scenario import Scenario, Streams, draw_look
 from hvs_suite.tasks.shared.spec import scene
 
@@ -168,18 +168,7 @@ _HARD = dataclasses.replace(
     tilt_tolerance_deg=0.5,
     hold_steps=3,
     time_limit_steps=40,
-    # A small disc leaves margin in a narrower view, which shows it larger.
-    eih_fov_deg=60.0,
-    eth_resolution=336,
-    # Wide enough for the ring when the camera is turned by the largest disturbance.
-    eth_fov_deg=33.0,
-    vary_light=True,
-    vary_colour=True,
-    vary_texture=True,
-    # Cut at two sigma: up to 1 cm and 1 deg a direction.
-    eth_position_noise_m=0.005,
-    eth_rotation_noise_deg=0.5,
-    image_noise=4.0,
+    **HARD,
 )
 
 register(
@@ -226,4 +215,3 @@ register(
         eih_fov_deg=60.0,
     ),
 )
-

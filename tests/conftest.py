@@ -12,7 +12,7 @@ import pytest
 import hvs_suite
 
 if TYPE_CHECKING:
-    from hvs_suite.cell.environment import Environment
+    from hvs_suite.tasks.shared.environment import Environment
 
 
 @pytest.fixture(scope="session")

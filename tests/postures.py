@@ -10,7 +10,7 @@ from hvs_suite.cell.kinematics import kinematics, tool_frame, travel_time
 from hvs_suite.cell.robot import JOINT_SPEED_RAD_S
 
 if TYPE_CHECKING:
-    from hvs_suite.cell.environment import Environment
+    from hvs_suite.tasks.shared.environment import Environment
 
 FloatArray = npt.NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])

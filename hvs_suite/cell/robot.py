@@ -233,6 +233,28 @@ def after_commands(
     return np.asarray(joints), np.asarray(velocities), set_point
 
 
+def set_point_to_reach(
+    goal: FloatArray, joints: FloatArray, set_point: FloatArray, period_s: float
+) -> FloatArray:
+    """The set point at the end of a control step that has the joints at a goal by then.
+
+    `after_commands` solved for the set point: with time constant tau = kv / kp, d = exp(-T / tau)
+    and c = tau / T, s1 = (goal - (c - d - c d) s0 - d q) / (1 - c + c d).
+
+    Args:
+        goal: Where the joints shall be, (7,) rad.
+        joints: Now, (7,) rad.
+        set_point: Now, (7,) rad.
+        period_s: Length of the control step T (s).
+
+    Returns:
+        (7,) rad; may be farther than the joints can go in a control step.
+    """
+    decay, share = np.exp(-period_s / LAG_S), LAG_S / period_s
+    ahead = goal - (share - decay - share * decay) * set_point - decay * joints
+    return np.asarray(ahead / (1.0 - share + share * decay))
+
+
 def _add_capsules(body: Any, name: str, capsules: tuple[_Capsule, ...], conaffinity: int) -> None:
     """Adds the collision capsules of one link to its body."""
     for i, capsule in enumerate(capsules):

@@ -16,7 +16,7 @@ from hvs_suite.cli import console
 from hvs_suite.errors import OptionError
 
 if TYPE_CHECKING:
-    from hvs_suite.cell.environment import Environment
+    from hvs_suite.tasks.shared.environment import Environment
 
 WORKER_ROUNDS = 3
 # Each episode moves every joint up to this far from where it starts (rad).

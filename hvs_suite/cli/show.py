@@ -14,8 +14,8 @@ from hvs_suite.cli.tasks import disturbances, tolerance
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from hvs_suite.cell.environment import Environment
     from hvs_suite.tasks.shared.certificate import Certificate, Check
+    from hvs_suite.tasks.shared.environment import Environment
     from hvs_suite.tasks.shared.spec import Spec
 
 CELL_PX = 720

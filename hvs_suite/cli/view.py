@@ -13,8 +13,8 @@ from hvs_suite.cli.console import console
 from hvs_suite.errors import RenderError
 
 if TYPE_CHECKING:
-    from hvs_suite.cell.environment import Environment
     from hvs_suite.rollout import Episode, Policy
+    from hvs_suite.tasks.shared.environment import Environment
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

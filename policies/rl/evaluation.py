@@ -16,7 +16,7 @@ from hvs_suite.statistics import wilson_interval
 from hvs_suite.tasks.shared.spec import Spec
 
 if TYPE_CHECKING:
-    from hvs_suite.cell.environment import Environment
+    from hvs_suite.tasks.shared.environment import Environment
 
 SPLIT = "validation"
 """Neither what is trained on nor what is scored."""

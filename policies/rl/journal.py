@@ -132,9 +132,7 @@ class Journal(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._actions = []
 
 
-def make_journal(
-    variant: Spec, options: Mapping[str, Any], split: str, seed: int
-) -> Journal:
+def make_journal(variant: Spec, options: Mapping[str, Any], split: str, seed: int) -> Journal:
     """Makes the Gymnasium environment of a named task, monitored and with a journal.
 
     Args:

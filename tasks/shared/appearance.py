@@ -38,9 +38,7 @@ class Appearance:
         self._eth = int(physics.bind(cell.eth).element_id)
         self._light = int(physics.bind(cell.light).element_id)
         self._surface = int(physics.bind(cell.surface.material).element_id)
-        self._targets = [
-            int(physics.bind(marker.material).element_id) for marker in cell.markers
-        ]
+        self._targets = [int(physics.bind(marker.material).element_id) for marker in cell.markers]
         self._shells = np.array(physics.bind(cell.robot.shell_geoms).element_id, int).ravel()
         self._texture = int(physics.bind(cell.surface.texture).element_id)
         self._defaults: dict[str, npt.NDArray[Any]] = {

@@ -4,7 +4,7 @@
 few methods (see `hvs_suite.tasks.shared.family`).
 """
 
-from typing import Any
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
@@ -14,8 +14,8 @@ from dm_env import specs
 
 from hvs_suite.cell import cameras
 from hvs_suite.cell.arena import Cell
-from hvs_suite.cell.environment import ServoTask
 from hvs_suite.cell.kinematics import kinematics
+from hvs_suite.cell.renderer import Renderer
 from hvs_suite.cell.robot import (
     JOINT_ACCELERATION_RAD_S2,
     JOINT_RANGE_RAD,
@@ -35,7 +35,22 @@ FloatArray = npt.NDArray[np.float64]
 _RAY_SLACK_M = 0.003
 
 
-class ArmTask(ServoTask):
+class Stage(Protocol):
+    """What the task needs of the environment that plays it."""
+
+    clip_actions: bool
+    goal_ends_episode: bool
+
+    @property
+    def control_steps(self) -> int:
+        """Control steps since the last reset."""
+
+    @property
+    def renderer(self) -> Renderer:
+        """The kept renderer of the task's own cameras."""
+
+
+class ArmTask(composer.Task):
     """A family's task; one object plays any scenario of its split.
 
     Args:
@@ -47,12 +62,18 @@ class ArmTask(ServoTask):
         family: What is special about the task.
         source: Draws its scenarios.
         cameras: Cameras of the compiled model by name.
+        time_limit_steps: Control steps after which an episode is truncated.
+        camera_side: Side of the largest picture that the task observes (px).
+        multisampling: Samples per pixel.
+        environment: The environment that plays the task, set by it.
 
     Raises:
         OptionError: The control period is no multiple of the physics timestep, or a goal that was
             asked for is out of reach.
         ScenarioError: The split's name is empty.
     """
+
+    environment: Stage
 
     def __init__(self, family: Family[Any, Any], split: str = "train") -> None:
         spec: Spec = family.spec
@@ -203,6 +224,7 @@ class ArmTask(ServoTask):
         progress = Progress(steps, inside, self._n_inside)
         self._errors = errors | family.tally(physics, errors, progress)
         self._success = not collided and family.is_complete(progress)
+        self._steps_to_goal = family.steps_to_goal(progress) if self._success else None
         time_is_up = at_time_limit or family.is_over(progress)
         self._truncated = time_is_up and not self._is_final
         self._reward_terms = rewards.reward_terms(self.spec, self._step_outcome(physics))
@@ -284,7 +306,8 @@ class ArmTask(ServoTask):
 
         Returns:
             ``task`` and ``split`` (str), ``scenario`` (int), ``is_success``, ``success_once``
-            (inside tolerance at any control step's end), ``collision``, ``truncated`` (bool),
+            (inside tolerance at any control step's end), ``steps_to_goal`` (int, None without
+            success), ``collision``, ``truncated`` (bool),
             ``n_inside`` (control steps held so far), ``n_clipped`` (actions clipped) and
             ``errors``: every metric of the spec at the end of the last control step, by name.
         """
@@ -294,6 +317,7 @@ class ArmTask(ServoTask):
             "scenario": self.scenario.index,
             "is_success": self._success,
             "success_once": self._inside_once,
+            "steps_to_goal": self._steps_to_goal,
             "collision": self._collision,
             "truncated": self._truncated,
             "n_inside": self._n_inside,
@@ -309,9 +333,11 @@ class ArmTask(ServoTask):
         """Where the tool tip is now."""
         data = physics.data.ptr
         # Copies: MuJoCo's arrays change under the hands of whoever keeps them.
-        return Tip(
-            data.site_xpos[self._flange].copy(), data.site_xmat[self._flange][2::3].copy()
-        )
+        return Tip(data.site_xpos[self._flange].copy(), data.site_xmat[self._flange][2::3].copy())
+
+    def distance_m(self, physics: mjcf.Physics) -> float:
+        """How far the tip is from its goal (m)."""
+        return goal_errors(self.tip(physics), self.goal())[POSITION] / 1000.0
 
     def privileged(self, physics: mjcf.Physics) -> dict[str, FloatArray]:
         """What only training and the expert may see.
@@ -459,6 +485,7 @@ class ArmTask(ServoTask):
         self._n_clipped = 0
         self._inside_once = False
         self._success = False
+        self._steps_to_goal: int | None = None
         self._collision = False
         self._truncated = False
         self._reward_terms = {}

@@ -24,7 +24,7 @@ from hvs_suite.tasks.shared.goal import Goal
 from hvs_suite.tasks.shared.start import steps_lower_bound
 
 if TYPE_CHECKING:
-    from hvs_suite.cell.environment import Environment
+    from hvs_suite.tasks.shared.environment import Environment
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -221,9 +221,7 @@ def check_accuracy(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
     # Who measures a diameter calibrates it: what the median is off by is no error.
     rows[:, 2] = np.abs(rows[:, 2] - np.median(rows[:, 2]))
     tilt_deg, joint_height, image_height, image_lateral = np.percentile(rows, _PERCENTILE, axis=0)
-    lateral = math.hypot(
-        image_lateral, 1000.0 * spec.standoff_m * math.tan(math.radians(tilt_deg))
-    )
+    lateral = math.hypot(image_lateral, 1000.0 * spec.standoff_m * math.tan(math.radians(tilt_deg)))
     height_source = "joints" if joint_height <= image_height else "disc's diameter in EIH"
     lateral += CONTROL_RESIDUAL_MM
     height = min(joint_height, image_height) + CONTROL_RESIDUAL_MM
@@ -292,7 +290,7 @@ def _target_in(env: "Environment", camera: str) -> FloatArray:
 
 
 def joint_margin_deg(goal: Goal) -> float:
-    """Least margin to a joint stop in a goal's best posture (deg); -inf where it is out of reach."""
+    """Least margin to a joint stop in a goal's best posture (deg); -inf if it is out of reach."""
     family = kinematics().goal_configurations(goal.position, goal.normal)
     if not len(family):
         return -math.inf

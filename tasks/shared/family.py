@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from dm_control import mjcf
 
     from hvs_suite.cell.arena import Cell
-    from hvs_suite.cell.environment import Environment
     from hvs_suite.cell.surface import Surface
     from hvs_suite.tasks.shared.certificate import Check
+    from hvs_suite.tasks.shared.environment import Environment
     from hvs_suite.tasks.shared.scenario import Scenario, Streams
 
 FloatArray = npt.NDArray[np.float64]
@@ -84,6 +84,7 @@ class Family[S: Spec, C: Scenario](abc.ABC):
 
     def after_compile(self, physics: "mjcf.Physics") -> None:
         """Look up indices in the compiled model."""
+        del physics
 
     @abc.abstractmethod
     def draw(self, streams: "Streams") -> C:
@@ -98,6 +99,7 @@ class Family[S: Spec, C: Scenario](abc.ABC):
 
         Called at the end of each control step, before anything is measured.
         """
+        del physics, time_s
 
     @abc.abstractmethod
     def goal(self, ahead_s: float = 0.0) -> Goal:
@@ -132,6 +134,10 @@ class Family[S: Spec, C: Scenario](abc.ABC):
     def is_complete(self, progress: Progress) -> bool:
         """Whether the task has been done: all step bounds held for ``hold_steps`` in a row."""
         return progress.n_inside >= self.spec.hold_steps
+
+    def steps_to_goal(self, progress: Progress) -> int:
+        """Control steps to the goal, asked when it is complete."""
+        return progress.steps
 
     def is_over(self, progress: Progress) -> bool:
         """Whether the episode ends without success before the time limit, because time is up."""
@@ -184,8 +190,9 @@ def register(family: type[Family[Any, Any]], *specs: Spec) -> None:
     """
     for spec in specs:
         if not spec.name.startswith(f"{spec.family}-"):
-            raise OptionError(f"a task of family {spec.family} is called {spec.family}-..., not "
-                              f"{spec.name!r}")  # fmt: skip
+            raise OptionError(
+                f"a task of family {spec.family} is called {spec.family}-..., not {spec.name!r}"
+            )
         known = _registered.get(spec.name)
         if known is not None and known != Registered(spec, family):
             raise OptionError(f"there is another task called {spec.name!r}; choose another name")

@@ -10,9 +10,12 @@ import functools
 import hashlib
 import importlib.resources
 import json
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hvs_suite.tasks.shared.spec import Spec
+
+if TYPE_CHECKING:
+    from hvs_suite.tasks.shared.scenario import ScenarioSource
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,20 +60,19 @@ def digest(task: str) -> str:
     return lock()[task].digest
 
 
-def compute_entry(variant: Spec) -> LockEntry:
+def compute_entry(variant: Spec, source: "ScenarioSource") -> LockEntry:
     """Compute what a variant means now.
 
     Args:
         variant: A named task's parameters.
+        source: Its test split.
 
     Returns:
         The entry; draws all test scenarios, which takes seconds.
     """
     from hvs_suite.cell.robot import robot_mjcf
-    from hvs_suite.registry import make_task
-    from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
+    from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS
 
-    source = make_task(variant, TEST_SPLIT).source
     scenarios = "".join(source.draw(index).digest() for index in range(TEST_SCENARIOS))
     return LockEntry(
         version=variant.version,

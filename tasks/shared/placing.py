@@ -6,8 +6,9 @@ is measured is where the tool's tip stands over it and how far its axis is from 
 
 import dataclasses
 import math
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -32,12 +33,30 @@ if TYPE_CHECKING:
     from dm_control import mjcf
 
     from hvs_suite.cell.arena import Cell
-    from hvs_suite.cell.environment import Environment
     from hvs_suite.tasks.shared.certificate import Check
+    from hvs_suite.tasks.shared.environment import Environment
 
 FloatArray = npt.NDArray[np.float64]
 
 UP: FloatArray = np.array([0.0, 0.0, 1.0])
+
+HARD: Mapping[str, Any] = MappingProxyType(
+    {
+        # A small disc leaves margin in a narrower view, which shows it larger.
+        "eih_fov_deg": 60.0,
+        "eth_resolution": 336,
+        # Wide enough for the ring when the camera is turned by the largest disturbance.
+        "eth_fov_deg": 33.0,
+        "vary_light": True,
+        "vary_colour": True,
+        "vary_texture": True,
+        # Cut at two sigma: up to 1 cm and 1 deg a direction.
+        "eth_position_noise_m": 0.005,
+        "eth_rotation_noise_deg": 0.5,
+        "image_noise": 4.0,
+    }
+)
+"""What the hard variants of all families disturb, and the cameras that they are seen with."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

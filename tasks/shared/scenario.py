@@ -207,9 +207,7 @@ def draw_look(spec: Spec, streams: Streams) -> dict[str, Any]:
     surface_rgb = target_rgb = None
     tint: FloatArray = np.ones(3)
     if spec.vary_colour:
-        surface_rgb = np.clip(
-            colour.uniform(0.35, 0.85) + colour.uniform(-0.08, 0.08, 3), 0.0, 1.0
-        )
+        surface_rgb = np.clip(colour.uniform(0.35, 0.85) + colour.uniform(-0.08, 0.08, 3), 0.0, 1.0)
         target_rgb = np.array([colour.uniform(0.55, 0.95), *colour.uniform(0.02, 0.16, 2)])
         tint = np.asarray(colour.uniform(0.8, 1.1) * colour.uniform(0.95, 1.05, 3))
     return {

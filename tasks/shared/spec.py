@@ -156,12 +156,14 @@ class Spec(Timing, Cameras, Disturbances):
     """Name of the family, the first word of its tasks' names."""
     keypoints: ClassVar[tuple[str, ...]] = ("target",)
     """Points whose projections supervise eyes; `Family.keypoints` gives their places."""
+    further_privileged: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({})
+    """Columns of `Family.privileged`, with the names of their dimensions."""
     plays_on: ClassVar[bool] = True
     """Whether an episode can go on past its goal, to see where a policy settles."""
 
     name: str
     version: int = 1
-    start: Start = scene("zero")
+    start: Start = scene("zero")  # noqa: RUF009 - a field, and frozen
     observations: str = "vision"
     normalise_observation: bool = False
     action_mode: ActionMode = "joint_position"
@@ -216,9 +218,7 @@ class Spec(Timing, Cameras, Disturbances):
         if not 0.0 <= self.discount <= 1.0:
             raise OptionError(f"discount is {self.discount}; use 0 to 1")
 
-    def _check(
-        self, rule: str, holds: typing.Callable[[float], bool], *names: str
-    ) -> None:
+    def _check(self, rule: str, holds: typing.Callable[[float], bool], *names: str) -> None:
         """Hold fields against a rule.
 
         Args:
@@ -240,6 +240,24 @@ class Spec(Timing, Cameras, Disturbances):
         raise NotImplementedError
 
     @property
+    def privileged(self) -> dict[str, tuple[str, ...]]:
+        """Vectors that only training may see, with the names of their dimensions.
+
+        The goal, where each keypoint is in each camera's picture (see ``ArmTask.privileged``), and
+        the family's own.
+        """
+        return {
+            "goal_position": ("x", "y", "z"),
+            "goal_normal": ("x", "y", "z"),
+            **{
+                f"{keypoint}_{camera}": ("u", "v", "diameter", "visible")
+                for keypoint in self.keypoints
+                for camera in CAMERA_NAMES
+            },
+            **self.further_privileged,
+        }
+
+    @property
     def tolerances(self) -> dict[str, float]:
         """Bounds of the metrics that decide success, by name, in the metric's unit.
 
@@ -252,7 +270,7 @@ class Spec(Timing, Cameras, Disturbances):
 
     @property
     def step_bounds(self) -> dict[str, float]:
-        """Bounds on what is measured at the end of a control step: inside them, it counts as held."""
+        """Bounds on the step metrics: a control step that ends inside all of them counts as held."""
         return {
             metric.name: metric.bound
             for metric in self.metrics

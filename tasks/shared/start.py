@@ -73,9 +73,7 @@ def _fixed_start(streams: Streams, floor_normal: FloatArray) -> FloatArray:
     raise OptionError("no fixed start found that is clear of surface and self")
 
 
-def _random_start(
-    spec: Spec, streams: Streams, goal: Goal, floor_normal: FloatArray
-) -> FloatArray:
+def _random_start(spec: Spec, streams: Streams, goal: Goal, floor_normal: FloatArray) -> FloatArray:
     model = kinematics()
     random = streams.generator("start")
     bound = RANDOM_START_RANGE * JOINT_RANGE_RAD

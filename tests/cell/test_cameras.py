@@ -9,10 +9,10 @@ from postures import displaced, goal_posture, posture_at
 
 import hvs_suite
 from hvs_suite.cell import cameras
-from hvs_suite.cell.environment import Environment
 from hvs_suite.cell.marker import HALF_THICKNESS_M
 from hvs_suite.cell.renderer import Renderer
 from hvs_suite.tasks.shared.detection import find_disc
+from hvs_suite.tasks.shared.environment import Environment
 
 Named = Callable[..., Environment]
 FloatArray = npt.NDArray[np.float64]

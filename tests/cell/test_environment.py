@@ -12,9 +12,9 @@ from dm_env import StepType, test_utils
 from postures import posture_at
 
 import hvs_suite
-from hvs_suite.cell.environment import Environment
 from hvs_suite.cell.renderer import Renderer
 from hvs_suite.errors import ScenarioError
+from hvs_suite.tasks.shared.environment import Environment
 
 Named = Callable[..., Environment]
 

@@ -13,9 +13,9 @@ import pytest
 
 import hvs_suite
 from hvs_suite.cell import gl
-from hvs_suite.cell.environment import Environment
 from hvs_suite.cell.renderer import Renderer
 from hvs_suite.errors import RenderError
+from hvs_suite.tasks.shared.environment import Environment
 
 Named = Callable[..., Environment]
 

@@ -41,7 +41,7 @@ def test_an_honest_result_is_verified(name: str, made: Path) -> None:
 
 
 def test_verifying_draws_no_picture(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from hvs_suite.cell.environment import Environment
+    from hvs_suite.tasks.shared.environment import Environment
 
     def draw(self: Environment) -> None:
         pytest.fail("it drew a picture")

@@ -9,7 +9,6 @@ import pytest
 from postures import posture_at
 
 import hvs_suite
-from hvs_suite.cell.environment import Environment
 from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.cell.robot import (
     JOINT_ACCELERATION_RAD_S2,
@@ -18,6 +17,7 @@ from hvs_suite.cell.robot import (
 )
 from hvs_suite.errors import ActionError
 from hvs_suite.tasks.shared.actions import JOINT_DELTA_RAD, TWIST_ANGULAR_RAD_S, TWIST_LINEAR_M_S
+from hvs_suite.tasks.shared.environment import Environment
 
 Named = Callable[..., Environment]
 MODES = {"joint_position": 7, "joint_delta": 7, "joint_velocity": 7, "flange_twist": 6}

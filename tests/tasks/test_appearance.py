@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import hvs_suite
-from hvs_suite.cell.environment import Environment
 from hvs_suite.tasks.shared.appearance import surface_texture
 from hvs_suite.tasks.shared.detection import find_disc
+from hvs_suite.tasks.shared.environment import Environment
 
 Named = Callable[..., Environment]
 

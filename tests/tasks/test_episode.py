@@ -8,7 +8,7 @@ import pytest
 from postures import displaced, goal_posture, posture_at
 
 import hvs_suite
-from hvs_suite.cell.environment import Environment
+from hvs_suite.tasks.shared.environment import Environment
 
 Named = Callable[..., Environment]
 ERRORS = ("lateral_error_mm", "height_error_mm", "position_error_mm", "tilt_error_deg")

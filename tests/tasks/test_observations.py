@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import hvs_suite
-from hvs_suite.cell.environment import Environment
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
+from hvs_suite.tasks.shared.environment import Environment
 
 Named = Callable[..., Environment]
 PRIVILEGED = {"flange_position", "goal_position", "goal_normal", "target_position", "joint_offset"}

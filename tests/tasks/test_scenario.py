@@ -10,11 +10,11 @@ import pytest
 from scipy import stats
 
 import hvs_suite
-from hvs_suite.cell.environment import Environment
 from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.cell.robot import JOINT_RANGE_RAD
 from hvs_suite.cell.surface import Surface
 from hvs_suite.errors import OptionError, ScenarioError
+from hvs_suite.tasks.shared.environment import Environment
 from hvs_suite.tasks.shared.scenario import ScenarioSource, fixed_places, steps_lower_bound
 
 Named = Callable[..., Environment]

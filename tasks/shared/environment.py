@@ -11,7 +11,6 @@ What differs from ``composer.Environment``, and why:
 * nothing is drawn before the first ``reset``, so that processes may fork until then.
 """
 
-import abc
 import dataclasses
 import weakref
 from collections.abc import Sequence
@@ -21,58 +20,21 @@ import dm_env
 import mujoco
 import numpy as np
 import numpy.typing as npt
-from dm_control import composer, mjcf
+from dm_control import composer
 from dm_env import specs
 
 from hvs_suite.cell.cameras import CameraImage
 from hvs_suite.cell.renderer import Renderer
 from hvs_suite.errors import ScenarioError
+from hvs_suite.tasks.shared.arm_task import ArmTask
+from hvs_suite.tasks.shared.goal import Goal
+from hvs_suite.tasks.shared.scenario import Scenario
+from hvs_suite.tasks.shared.spec import Spec
 
 FloatArray = npt.NDArray[np.float64]
 Observation = dict[str, npt.NDArray[Any]]
 
-
-class ServoTask(composer.Task, abc.ABC):
-    """What the environment asks of a task, beyond composer's own contract.
-
-    Attributes:
-        time_limit_steps: Control steps after which an episode is truncated.
-        camera_side: Side of the largest picture that the task observes (px).
-        multisampling: Samples per pixel.
-        environment: The environment that plays the task, set by it.
-    """
-
-    time_limit_steps: int
-    camera_side: int
-    multisampling: int
-    environment: "Environment"
-
-    @abc.abstractmethod
-    def prepare(self, index: int) -> None:
-        """Draw scenario ``index``; called before composer's ``initialize_episode``."""
-
-    @abc.abstractmethod
-    def seeded_index(self, seed: int, count: int) -> int:
-        """Scenario that the ``count``-th reset after ``reset(seed=seed)`` plays."""
-
-    @abc.abstractmethod
-    def is_forbidden(self, physics: mjcf.Physics) -> bool:
-        """Whether a contact that exists now must never happen; asked after every substep."""
-
-    @abc.abstractmethod
-    def finish_step(
-        self, physics: mjcf.Physics, *, steps: int, collided: bool, at_time_limit: bool
-    ) -> None:
-        """Compute errors, success and the ends of the episode at the end of a control step."""
-
-    @abc.abstractmethod
-    def textures_to_upload(self) -> tuple[int, ...]:
-        """Ids of the textures that the last ``initialize_episode`` repainted."""
-
-    @property
-    @abc.abstractmethod
-    def has_ended(self) -> bool:
-        """Whether the last control step ended the episode."""
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -81,11 +43,11 @@ class Moment:
 
     Attributes:
         steps: Control steps since the reset.
-        qpos: Joint positions of the model (rad).
+        state: MuJoCo's full state, mocap bodies included, (n,).
     """
 
     steps: int
-    qpos: FloatArray
+    state: FloatArray
 
 
 class Environment(composer.Environment):
@@ -103,7 +65,7 @@ class Environment(composer.Environment):
         seed: Start of the stream that bare ``reset()`` calls walk; None draws one.
     """
 
-    def __init__(self, task: ServoTask, seed: int | None = None) -> None:
+    def __init__(self, task: ArmTask, seed: int | None = None) -> None:
         self.clip_actions = False
         self.goal_ends_episode = True
         self.draws = True
@@ -115,6 +77,7 @@ class Environment(composer.Environment):
             int(np.random.SeedSequence().generate_state(1, np.uint32)[0]) if seed is None else seed
         )
         self._count = 0
+        self._arm = task
         super().__init__(
             task, recompile_mjcf_every_episode=False, legacy_step=False, random_state=0
         )
@@ -140,9 +103,9 @@ class Environment(composer.Environment):
                 if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
                     raise ScenarioError(f"a seed is a whole number from 0 up, not {seed!r}")
                 self._seed, self._count = int(seed), 0
-            scenario = self.task.seeded_index(self._seed, self._count)
+            scenario = self._arm.seeded_index(self._seed, self._count)
             self._count += 1
-        self.task.prepare(scenario)
+        self._arm.prepare(scenario)
         self._control_steps = 0
         with self._physics.reset_context():
             self._hooks.initialize_episode(self._physics_proxy, self._random_state)
@@ -169,7 +132,7 @@ class Environment(composer.Environment):
         physics = self._physics_proxy
         self._hooks.before_step(physics, action, self._random_state)
         model, data = self._physics.model.ptr, self._physics.data.ptr
-        task = self.task
+        task = self._arm
         collided = False
         for _ in range(self._n_sub_steps):
             mujoco.mj_step2(model, data)
@@ -195,14 +158,13 @@ class Environment(composer.Environment):
         """Shapes, types and bounds of the observations, known without drawing anything."""
         return {
             name: item.array_spec.replace(name=name)
-            for name, item in self.task.observables.items()
+            for name, item in self._arm.observables.items()
             if item.enabled
         }
 
     def action_spec(self) -> specs.BoundedArray:
         """Seven (or six) numbers in [-1, 1]."""
-        spec: specs.BoundedArray = self.task.action_spec(self._physics_proxy)
-        return spec
+        return self._arm.action_spec(self._physics_proxy)
 
     def close(self) -> None:
         """Free renderers and physics; calling it again does nothing."""
@@ -230,69 +192,72 @@ class Environment(composer.Environment):
 
     @property
     def info(self) -> dict[str, Any]:
-        """Outcome so far; keys as in ``Align.info``, and ``steps``."""
-        return {**self.task.info(), "steps": self._control_steps}
+        """Outcome so far; keys as in ``ArmTask.info``, and ``steps``."""
+        return {**self._arm.info(), "steps": self._control_steps}
 
     @property
-    def variant(self) -> Any:
+    def variant(self) -> Spec:
         """The task's parameters."""
-        return self.task.spec
+        return self._arm.spec
 
     @property
     def split(self) -> str:
         """Name of the stream of scenarios."""
-        return str(self.task.source.split)
+        return self._arm.source.split
 
     @property
-    def scenario(self) -> Any:
+    def scenario(self) -> Scenario:
         """The scenario being played."""
-        return self.task.scenario
+        return self._arm.scenario
 
     @property
     def joint_positions(self) -> FloatArray:
         """True joint angles, (7,) rad."""
-        positions: FloatArray = self.task.joint_positions(self._physics_proxy)
-        return positions
+        return self._arm.joint_positions(self._physics_proxy)
 
     @property
     def joint_velocities(self) -> FloatArray:
         """True joint speeds, (7,) rad/s."""
-        velocities: FloatArray = self.task.joint_velocities(self._physics_proxy)
-        return velocities
+        return self._arm.joint_velocities(self._physics_proxy)
 
     @property
     def setpoint(self) -> FloatArray:
         """True joint set point that the controller tracks now, (7,) rad."""
-        setpoint: FloatArray = self.task.setpoint(self._physics_proxy)
-        return setpoint
+        return self._arm.setpoint(self._physics_proxy)
 
     @property
     def pending_setpoints(self) -> list[FloatArray]:
         """True set points that were commanded and still wait out the latency, oldest first."""
-        return list(self.task.pending_setpoints())
+        return self._arm.pending_setpoints()
+
+    def goal(self, ahead_s: float = 0.0) -> Goal:
+        """Where the tool's tip has to be now, or some time from now (s)."""
+        return self._arm.goal(ahead_s)
+
+    @property
+    def distance_m(self) -> float:
+        """How far the tip is from its goal (m)."""
+        return self._arm.distance_m(self._physics_proxy)
 
     def commandable(self, q: npt.ArrayLike) -> npt.NDArray[np.float32]:
         """The ``joint_position`` action that sends the arm to true joint angles (7,) rad."""
-        action: npt.NDArray[np.float32] = self.task.commandable(q)
-        return action
+        return self._arm.commandable(q)
 
     @property
     def landing_mm(self) -> FloatArray:
-        """Where the flange axis stands over the target now, (2,) mm; see ``Align.landing_mm``."""
-        landing: FloatArray = self.task.landing_mm(self._physics_proxy)
-        return landing
+        """Where the flange axis stands over the target now, (2,) mm; see ``ArmTask.landing_mm``."""
+        return self._arm.landing_mm(self._physics_proxy)
 
     def privileged(self) -> dict[str, FloatArray]:
-        """What only training and the expert may see; keys as in ``Align.privileged``."""
-        values: dict[str, FloatArray] = self.task.privileged(self._physics_proxy)
-        return values
+        """What only training and the expert may see; keys as in ``ArmTask.privileged``."""
+        return self._arm.privileged(self._physics_proxy)
 
     @property
     def renderer(self) -> Renderer:
         """The kept renderer of the task's own cameras, made when first asked for."""
         if self._renderer is None:
             self._renderer = Renderer(
-                self._physics.model.ptr, self.task.camera_side, self.task.multisampling
+                self._physics.model.ptr, self._arm.camera_side, self._arm.multisampling
             )
             self._upload_textures()
         return self._renderer
@@ -314,14 +279,22 @@ class Environment(composer.Environment):
         if side not in self._studio:
             renderer = Renderer(self._physics.model.ptr, side, 4, studio=True)
             self._studio[side] = renderer
-            for texture in self.task.textures_to_upload():
+            for texture in self._arm.textures_to_upload():
                 renderer.upload_texture(texture)
-        view = self.task.view(self._physics_proxy, camera)
+        view = self._arm.view(self._physics_proxy, camera)
         return self._studio[side].colour(self._physics.data.ptr, view, height, width)
 
     def moment(self) -> Moment:
         """What ``pictures`` needs to know of the present."""
-        return Moment(self._control_steps, self._physics.data.ptr.qpos.copy())
+        model, data = self._physics.model.ptr, self._physics.data.ptr
+        state = np.empty(mujoco.mj_stateSize(model, _STATE))
+        mujoco.mj_getState(model, data, state, _STATE)
+        return Moment(self._control_steps, state)
+
+    def _return_to(self, moment: Moment) -> None:
+        """Put the model's state back to a moment; what follows from it is not computed."""
+        self._control_steps = moment.steps
+        mujoco.mj_setState(self._physics.model.ptr, self._physics.data.ptr, moment.state, _STATE)
 
     def pictures(self, moments: Sequence[Moment]) -> dict[str, list[npt.NDArray[Any]]]:
         """Draw what the cameras showed at moments of this episode, exactly as observed then.
@@ -338,20 +311,20 @@ class Environment(composer.Environment):
         model, data = self._physics.model.ptr, self._physics.data.ptr
         cameras = {
             name: item
-            for name, item in self.task.observables.items()
+            for name, item in self._arm.observables.items()
             if item.enabled and isinstance(item, CameraImage)
         }
         drawn: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in cameras}
         present = self.moment()
         try:
             for moment in moments:
-                self._control_steps, data.qpos[:] = moment.steps, moment.qpos
+                self._return_to(moment)
                 mujoco.mj_kinematics(model, data)
                 mujoco.mj_camlight(model, data)
                 for name, item in cameras.items():
                     drawn[name].append(item(self._physics_proxy, self._random_state))
         finally:
-            self._control_steps, data.qpos[:] = present.steps, present.qpos
+            self._return_to(present)
             mujoco.mj_step1(model, data)
         return drawn
 
@@ -359,14 +332,14 @@ class Environment(composer.Environment):
         physics, random_state = self._physics_proxy, self._random_state
         return {
             name: item(physics, random_state)
-            for name, item in self.task.observables.items()
+            for name, item in self._arm.observables.items()
             if item.enabled and (self.draws or not isinstance(item, CameraImage))
         }
 
     def _upload_textures(self) -> None:
         for renderer in (self._renderer, *self._studio.values()):
             if renderer is not None:
-                for texture in self.task.textures_to_upload():
+                for texture in self._arm.textures_to_upload():
                     renderer.upload_texture(texture)
 
     def _recompile_physics_and_update_observables(self) -> None:
@@ -377,4 +350,4 @@ class Environment(composer.Environment):
         self._n_sub_steps = self._task.physics_steps_per_control_step
         self._hooks.refresh_entity_hooks()
         self._hooks.after_compile(self._physics_proxy, self._random_state)
-        self.task.environment = weakref.proxy(self)
+        self._arm.environment = weakref.proxy(self)

@@ -1,0 +1,461 @@
+"""The planner: the fastest way to a goal from wherever the arm is, every control step.
+
+It keeps no memory of its own plan, and therefore answers the same for any policy that brought the
+arm to a state: what DAgger needs. The expert plans with what is true, the classical baseline with
+what it believes.
+
+A decision is:
+
+1. Rank the goal's whole redundant family (elbow swivel, mirror shapes, free yaw) by the least
+   travel time from the present position and velocity under speed and acceleration limits.
+2. Take the first whose time-optimal motion (ruckig) keeps clear of surface and self.
+3. Answer with the point of that motion at the end of the control step, and a little further: the
+   arm trails its set point.
+
+A goal that moves is met where it will be, and then followed (see `Planner.follow`).
+"""
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+
+import numpy as np
+import numpy.typing as npt
+import ruckig
+
+from hvs_suite.cell import robot
+from hvs_suite.cell.kinematics import Kinematics, kinematics
+from hvs_suite.tasks.shared.goal import Goal
+
+FloatArray = npt.NDArray[np.float64]
+
+CLEARANCE_M = 0.010
+"""Distance that a motion keeps from the surface and between links (m)."""
+ESCAPE_HEIGHT_M = 0.15
+"""Where no way to the goal is clear, go above it first (m)."""
+N_SWIVEL = 360
+"""Elbow places in the ranked family; one degree apart costs under 10 ms of travel time."""
+PROJECTION_RANGE_M = 0.15
+"""Below this distance the nearest configuration of the goal is also computed exactly (m)."""
+TIE_BREAK_S = 0.01
+"""Price of unneeded motion: small against a control step, enough to make the choice unique."""
+
+LEAD_S = 0.025
+"""How far the set point runs ahead of the motion (s): a little less than the joints' lag, tuned for
+the fewest steps. More overshoots the goal, less arrives late."""
+
+PLAIN_SWIVELS = 1
+"""The elbow straight above: two postures within reach, as a rule."""
+
+_FULL_SPEED: FloatArray = robot.JOINT_SPEED_RAD_S[:6, None]
+_MAX_PATHS = 24
+_MAX_ESCAPES = 4
+_MAX_FLANGE_SPEED_M_S = 2.5
+_PATH_STEP_S = 0.02
+_DISTINCT_RAD = 0.2
+# Ruckig fails on some targets that braking reaches exactly; one beside them will do.
+_NUDGES_RAD = (0.0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3)
+_ITERATIONS = 8
+_LEVEL = 1.0 - 1e-12
+_MEETINGS = 3
+"""How often the time is refined at which a moving goal is met: each round halves the error or
+better, because targets move far slower than the arm."""
+_N_ONWARD_SWIVEL = 36
+_ONWARD_SLACK_S = 0.2
+"""A posture whose way on takes this much longer than the shortest way on is not chosen."""
+
+
+def stopping_travel_time(
+    q: FloatArray, velocity: FloatArray, goals: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Least time to come to rest at each goal from a moving start, joint by joint.
+
+    Per joint with x = distance along the direction s of the motion, u = s v the speed along it
+    (negative where the joint must first turn back), a and w its acceleration and speed limits:
+    peak speed p = sqrt(a x + u^2 / 2); t = (2 p - u) / a where p <= w, otherwise
+    t = (w - u) / a + w / a + (x - (2 w^2 - u^2) / (2 a)) / w. s is the sign of the way that is
+    left after braking as hard as possible.
+
+    Args:
+        q: Angles (n,) of the first n joints in rad.
+        velocity: Their velocities (n,) in rad/s.
+        goals: Goal configurations (m, n) in rad.
+
+    Returns:
+        Time of the slowest joint (m,) in s, and the sum over joints of (distance / speed)^2 (m,)
+        in s^2.
+    """
+    return _stopping_travel_time(q, velocity, np.ascontiguousarray(goals.T))
+
+
+def _stopping_travel_time(
+    q: FloatArray, velocity: FloatArray, goals: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """``stopping_travel_time`` for goals (n, m), joint by joint along the first axis."""
+    a = robot.JOINT_ACCELERATION_RAD_S2[: len(q), None]
+    w = robot.JOINT_SPEED_RAD_S[: len(q), None]
+    way = goals - q[:, None]
+    v = np.minimum(np.maximum(velocity[:, None], -w), w)
+    side = np.where(way >= v * np.abs(v) / (2.0 * a), 1.0, -1.0)
+    x, u = side * way, side * v
+    peak = np.sqrt(np.maximum(a * x + 0.5 * v**2, 0.0))
+    bang_bang = (2.0 * peak - u) / a
+    cruising = (2.0 * w - u) / a + (x - (2.0 * w**2 - v**2) / (2.0 * a)) / w
+    times = np.where(peak <= w, bang_bang, cruising)
+    return times.max(axis=0), ((way / w) ** 2).sum(axis=0)
+
+
+class Planner:
+    """Plans for one arm; every answer stands on what is given with it alone.
+
+    Args:
+        period_s: Control period (s).
+        plain: Go to the goal in one of two postures, the elbow straight above the line from
+            shoulder to wrist, A1 towards the target or away from it: the one whose slowest joint
+            arrives first at full speed. Which of some two thousand postures is the soonest jumps
+            with every little change of where the arm stands; two can be learned
+            (docs/experiments/simple-ways.md). They cost three steps.
+    """
+
+    def __init__(self, period_s: float, *, plain: bool = False) -> None:
+        self._kinematics: Kinematics = kinematics()
+        self._period_s = period_s
+        self._plain = plain
+        self._n_swivel = PLAIN_SWIVELS if plain else N_SWIVEL
+        self._goal_key: bytes = b""
+        self._family: FloatArray = np.empty((7, 1))
+        """The goal's configurations, one a column; the last is kept free."""
+        self._across: FloatArray = np.empty((2, 3))
+        """Two directions along the goal's surface, (2, 3)."""
+        self._floor_m = 0.0
+        self._clearance_m = 0.0
+        """Of the present state."""
+        self._soonest_s = math.inf
+        """What the soonest way to the goal took a control step ago (s)."""
+        self._ruckig = ruckig.Ruckig(7)
+        self._input = ruckig.InputParameter(7)
+        self._input.max_velocity = list(robot.JOINT_SPEED_RAD_S)
+        self._input.max_acceleration = list(robot.JOINT_ACCELERATION_RAD_S2)
+        # No jerk limit: within a control step the cell's set point moves at constant speed, so a
+        # ramp that is shorter than the step cannot be executed, and a longer one costs time.
+
+    def next_set_point(
+        self, q: FloatArray, velocity: FloatArray, goal: Goal, *, onward: Goal | None = None
+    ) -> FloatArray:
+        """Where the set point shall be at the end of the control step, to come to rest at a goal.
+
+        Args:
+            q: Joint angles now, (7,) rad.
+            velocity: Joint velocities now, (7,) rad/s.
+            goal: Where the flange has to be.
+            onward: Where it goes next, if the goal is only on the way: postures from which that
+                takes long are left out.
+
+        Returns:
+            (7,) rad; `q` where the goal is out of reach.
+        """
+        self._look_around(q, goal)
+        self._remember_goal(goal)
+        family = self._reachable(q, velocity, goal)
+        if onward is not None:
+            family = self._with_short_way_on(family, onward)
+        if len(family) == 0:
+            return q
+        required = min(CLEARANCE_M, self._clearance_m - 1e-3)
+        candidates = self._in_order(q, velocity, family)
+        motion = self._first_clear(q, velocity, candidates, required)
+        if motion is None:
+            motion = self._escape(q, velocity, goal, required)
+        return self._point_ahead(motion)
+
+    def towards_posture(
+        self, q: FloatArray, velocity: FloatArray, posture: FloatArray
+    ) -> FloatArray | None:
+        """Where the set point shall be at the end of the control step on the way to a posture.
+
+        Args:
+            q: Joint angles now, (7,) rad.
+            velocity: Joint velocities now, (7,) rad/s.
+            posture: Where to rest, each joint as fast as it can, (7,) rad.
+
+        Returns:
+            (7,) rad, or None where the way there is not clear.
+        """
+        self._floor_m = 0.0
+        self._clearance_m = self._kinematics.clearance(q, self._floor_m)
+        motion = self._motion(q, velocity, posture, together=False)
+        if self._least_clearance(motion, CLEARANCE_M) < CLEARANCE_M:
+            return None
+        return self._point_ahead(motion)
+
+    def follow(
+        self,
+        q: FloatArray,
+        velocity: FloatArray,
+        set_point: FloatArray,
+        goal_in: Callable[[float], Goal],
+    ) -> FloatArray:
+        """Where the set point shall be at the end of the control step, to stay with a moving goal.
+
+        Near the goal, the posture nearest to the present one is taken at which the flange is where
+        the goal will be at the end of the control step, and the set point that brings the arm there
+        exactly (`robot.set_point_to_reach`). Where that is too far for one step, the arm heads for
+        the place where it can meet the goal soonest.
+
+        Args:
+            q: Joint angles now, (7,) rad.
+            velocity: Joint velocities now, (7,) rad/s.
+            set_point: Now, (7,) rad.
+            goal_in: The goal some time from now (s).
+
+        Returns:
+            (7,) rad.
+        """
+        soon = goal_in(self._period_s)
+        self._remember_goal(soon)
+        posture = self._nearest_posture(q, soon)
+        if posture is not None:
+            led = robot.set_point_to_reach(posture, q, set_point, self._period_s)
+            within = np.abs(led - set_point) <= robot.JOINT_SPEED_RAD_S * self._period_s
+            if within.all() and (np.abs(led) <= robot.JOINT_RANGE_RAD).all():
+                return led
+        ahead_s = 0.0
+        for _ in range(_MEETINGS):
+            goal = goal_in(ahead_s)
+            self._remember_goal(goal)
+            family = self._reachable(q, velocity, goal)
+            if len(family) == 0:
+                break
+            times, _ = stopping_travel_time(q[:6], velocity[:6], family[:, :6])
+            ahead_s = float(times.min())
+        return self.next_set_point(q, velocity, goal_in(ahead_s))
+
+    def _look_around(self, q: FloatArray, goal: Goal) -> None:
+        """Take in how far the arm is from what it must not touch."""
+        # Distances are to a level plane. Where the surface is not level at the target, that is the
+        # target's height, which is right near the goal and a guess far from it.
+        height = float(goal.target[2])
+        self._floor_m = height if goal.normal[2] > _LEVEL else height - CLEARANCE_M
+        self._clearance_m = self._kinematics.clearance(q, self._floor_m)
+
+    def _remember_goal(self, goal: Goal) -> None:
+        """Computes the goal's family of configurations once a goal."""
+        key = goal.position.tobytes() + goal.normal.tobytes()
+        if key != self._goal_key:
+            self._goal_key = key
+            self._soonest_s = math.inf
+            self._across = np.linalg.svd(goal.normal[None])[2][1:]
+            family = self._kinematics.goal_configurations_at_tool_angle(
+                goal.position, goal.normal, tool_angle=0.0, n_swivel=self._n_swivel
+            )
+            self._family = np.empty((7, len(family) + 1))
+            self._family[:, :-1] = family.T
+
+    def _with_short_way_on(self, family: FloatArray, onward: Goal) -> FloatArray:
+        """The configurations (m, 7) of a family from which the next goal is soon reached."""
+        if len(family) == 0:
+            return family
+        there = self._kinematics.goal_configurations_at_tool_angle(
+            onward.position, onward.normal, family[0, 6], n_swivel=_N_ONWARD_SWIVEL
+        )
+        if len(there) == 0:
+            return family
+        seconds = np.zeros((len(family), len(there)), np.float32)
+        for here, after, speed in zip(family.T, there.T, robot.JOINT_SPEED_RAD_S, strict=True):
+            way = np.subtract.outer(here.astype(np.float32), after.astype(np.float32))
+            np.maximum(seconds, np.abs(way) / np.float32(speed), out=seconds)
+        soonest = seconds.min(axis=1)
+        return np.asarray(family[soonest <= soonest.min() + _ONWARD_SLACK_S])
+
+    def _in_order(
+        self, q: FloatArray, velocity: FloatArray, family: FloatArray
+    ) -> Iterator[FloatArray]:
+        """Goal configurations (7,) of a family (m, 7), the one reached soonest first.
+
+        The first is nearly always clear, so it is found without timing all: none is reached sooner
+        than at full speed, and as a rule the soonest is no farther away than it was a control step
+        ago. Where that fails all are timed, so the answer does not depend on the last one.
+        """
+        if self._plain:
+            times = (np.abs(family - q) / robot.JOINT_SPEED_RAD_S)[:, :6].max(axis=1)
+            yield from family[np.argsort(times, kind="stable")]
+            return
+        # Joint by joint along the first axis: NumPy is slow over rows of seven.
+        joints = family[:, :6].T
+
+        def price(goals: FloatArray) -> FloatArray:
+            times, effort = _stopping_travel_time(q[:6], velocity[:6], goals)
+            return times + TIE_BREAK_S * effort
+
+        bound = (np.abs(joints - q[:6, None]) / _FULL_SPEED).max(axis=0)
+        [listed] = np.nonzero(bound <= self._soonest_s)
+        prices = price(joints.take(listed, axis=1))
+        if len(listed) == 0 or prices.min() > self._soonest_s:
+            listed, prices = np.arange(len(family)), price(joints)
+        least = int(prices.argmin())
+        # A little slack, because bounds and prices are rounded.
+        self._soonest_s, first = float(prices[least]) + 1e-9, int(listed[least])
+        yield family[first]
+        for column in np.argsort(price(joints), kind="stable").tolist():
+            if column != first:
+                yield family[column]
+
+    def _point_ahead(self, motion: ruckig.Trajectory) -> FloatArray:
+        """Where a motion is at the end of the control step (7,); the arm trails its set point."""
+        ahead = min(self._period_s + LEAD_S, motion.duration)
+        return np.asarray(motion.at_time(ahead)[0])
+
+    def _first_clear(
+        self,
+        q: FloatArray,
+        velocity: FloatArray,
+        candidates: Iterable[FloatArray],
+        required: float,
+    ) -> ruckig.Trajectory | None:
+        """The motion to the first candidate that keeps clear; skips what is near a blocked one."""
+        blocked: list[FloatArray] = []
+        for goal in candidates:
+            if any(np.abs(goal - other).max() < _DISTINCT_RAD for other in blocked):
+                continue
+            motion = self._motion(q, velocity, goal)
+            if self._least_clearance(motion, required) >= required:
+                return motion
+            blocked.append(goal)
+            if len(blocked) >= _MAX_PATHS:
+                break
+        return None
+
+    def _escape(
+        self,
+        q: FloatArray,
+        velocity: FloatArray,
+        goal: Goal,
+        required: float,
+    ) -> ruckig.Trajectory:
+        """A motion away from obstacles where all ways to the goal are blocked or too fast.
+
+        To a place above the goal, towards the upright posture, or braking, whichever keeps clear
+        first or else clearest; each joint as fast as it can.
+        """
+        above = self._kinematics.goal_configurations_at_tool_angle(
+            goal.position + ESCAPE_HEIGHT_M * goal.normal,
+            goal.normal,
+            tool_angle=q[6],
+            n_swivel=24,
+        )
+        rest = _where_braking_ends(q, velocity)
+        rest = np.clip(rest, -robot.JOINT_RANGE_RAD, robot.JOINT_RANGE_RAD)
+        upright = np.append(np.zeros(6), rest[6])
+        nearest = above[np.argsort(np.abs(above - rest).max(axis=1))[:_MAX_ESCAPES]]
+        best, clearest = -np.inf, self._motion(q, velocity, rest, together=False)
+        for target in (*nearest, upright, 0.5 * (rest + upright), rest):
+            motion = self._motion(q, velocity, target, together=False)
+            least = self._least_clearance(motion, -np.inf)
+            if least >= required:
+                return motion
+            if least > best:
+                best, clearest = least, motion
+        return clearest
+
+    def _reachable(self, q: FloatArray, velocity: FloatArray, goal: Goal) -> FloatArray:
+        """Goal configurations (m, 7), in no order; good until it is asked again.
+
+        A7 alone turns the free yaw, so it is left where it comes to rest.
+        """
+        rest = _where_braking_ends(q, velocity)
+        # Beside the two plain postures, the nearest would be another goal for every place that the
+        # arm comes from.
+        nearest = None if self._plain else self._nearest_posture(rest, goal)
+        family = self._family
+        if nearest is None:
+            family = family[:, :-1]
+        else:
+            family[:, -1] = nearest
+        family[6] = min(max(rest[6], -robot.JOINT_RANGE_RAD[6]), robot.JOINT_RANGE_RAD[6])
+        return family.T
+
+    def _nearest_posture(self, q: FloatArray, goal: Goal) -> FloatArray | None:
+        """The configuration (7,) of a goal that is nearest to joint angles (7,), by Gauss-Newton.
+
+        Distances are weighed by the accelerations, as travel times over short ways are. None far
+        from the goal, where the family's one-degree grid is as good, or outside the joint ranges.
+        """
+        a = robot.JOINT_ACCELERATION_RAD_S2
+        posture = q
+        for iteration in range(_ITERATIONS):
+            R, flange = self._kinematics.flange_pose(posture)
+            away = goal.position - flange
+            if iteration == 0 and math.hypot(*away.tolist()) > PROJECTION_RANGE_M:
+                return None
+            # Rotation vector that takes the flange axis onto the inward normal; yaw stays free.
+            across, turn = self._across, _cross(R[:, 2], -goal.normal)
+            error = np.concatenate([away, across @ turn])
+            if np.abs(error).max() < 1e-9:
+                break
+            jacobian = self._kinematics.jacobian(posture)
+            weighted = np.concatenate([jacobian[:3], across @ jacobian[3:]]) * a
+            posture = posture + a * _least_solution(weighted, error)
+        else:
+            return None
+        if (np.abs(posture) > robot.JOINT_RANGE_RAD).any() or R[:, 2] @ goal.normal > 0.0:
+            return None
+        return np.asarray(posture)
+
+    def _motion(
+        self, q: FloatArray, velocity: FloatArray, goal: FloatArray, *, together: bool = True
+    ) -> ruckig.Trajectory:
+        """The time-optimal motion to rest at a goal, the joints arriving together or each alone."""
+        # Ruckig's root finding stumbles over distances at the limit of double precision.
+        ends = goal.tolist()
+        self._input.current_position = [
+            end if abs(angle - end) < 1e-9 else angle
+            for angle, end in zip(q.tolist(), ends, strict=True)
+        ]
+        self._input.current_velocity = [
+            0.0 if abs(speed) < 1e-9 else min(max(speed, -limit), limit)
+            for speed, limit in zip(velocity.tolist(), self._input.max_velocity, strict=True)
+        ]
+        self._input.synchronization = (
+            ruckig.Synchronization.Time if together else ruckig.Synchronization.No
+        )
+        trajectory = ruckig.Trajectory(7)
+        for nudge in _NUDGES_RAD:
+            self._input.target_position = [end + nudge for end in ends]
+            try:
+                self._ruckig.calculate(self._input, trajectory)
+            except ruckig.RuckigError:
+                continue
+            return trajectory
+        raise RuntimeError(f"ruckig finds no motion from {q} at {velocity} to {goal}")
+
+    def _least_clearance(self, motion: ruckig.Trajectory, required: float) -> float:
+        """Least clearance (m) along a motion from the present state.
+
+        Stops looking once it falls below ``required``.
+        Steps as far as the arm can get within the distance found (conservative advancement).
+        """
+        least = clearance = self._clearance_m
+        t = 0.0
+        while least >= required and t < motion.duration:
+            t += max(_PATH_STEP_S, (clearance - CLEARANCE_M) / _MAX_FLANGE_SPEED_M_S)
+            q = motion.at_time(min(t, motion.duration))[0]
+            clearance = self._kinematics.clearance(q, self._floor_m)
+            least = min(least, clearance)
+        return least
+
+
+def _where_braking_ends(q: FloatArray, velocity: FloatArray) -> FloatArray:
+    """Where each joint comes to rest (7,) if it brakes as hard as it can."""
+    return q + velocity * np.abs(velocity) / (2.0 * robot.JOINT_ACCELERATION_RAD_S2)
+
+
+def _least_solution(A: FloatArray, b: FloatArray) -> FloatArray:
+    """The least x with A x = b as near as can be, leaving out directions that hardly count."""
+    u, s, vt = np.linalg.svd(A, full_matrices=False)
+    # ``np.linalg.pinv`` spends more on its checks than on its work.
+    return np.asarray(np.where(s > 1e-3 * s[0], (b @ u) / s, 0.0) @ vt)
+
+
+def _cross(one: FloatArray, two: FloatArray) -> FloatArray:
+    """Vector product (3,) of two vectors (3,); NumPy's is slow on so few numbers."""
+    (a, b, c), (x, y, z) = one.tolist(), two.tolist()
+    return np.array([b * z - c * y, c * x - a * z, a * y - b * x])

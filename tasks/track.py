@@ -1,0 +1,293 @@
+"""``track``: stay over a target that moves.
+
+A disc moves over the table, on a conveyor (a straight line at constant speed) or along a smooth
+curve that nobody can foresee. Episodes are always played to their time limit: what counts is to be
+inside the tolerances at the end of each of the last control steps. What is hard is that pictures
+show where the target was: the arm trails its set point, and a policy has to aim ahead.
+"""
+
+import dataclasses
+from collections import deque
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from hvs_suite.errors import OptionError
+from hvs_suite.tasks.shared.family import Progress, register
+from hvs_suite.tasks.shared.goal import POSITION, TILT, Goal
+from hvs_suite.tasks.shared.metric import Metric
+from hvs_suite.tasks.shared.placing import HARD, UP, Placing, PlacingSpec
+from hvs_suite.tasks.shared.scenario import Scenario, Streams, draw_look
+from hvs_suite.tasks.shared.spec import scene
+
+if TYPE_CHECKING:
+    from dm_control import mjcf
+
+    from hvs_suite.tasks.shared.certificate import Check
+    from hvs_suite.tasks.shared.environment import Environment
+
+FloatArray = npt.NDArray[np.float64]
+
+WORST_POSITION = "worst_position_error_mm"
+WORST_TILT = "worst_tilt_error_deg"
+RMS_POSITION = "rms_position_error_mm"
+TIME_INSIDE = "time_inside_pc"
+
+SETTLING_STEPS = 20
+"""Control steps at the beginning that do not count for the share of time inside."""
+_N_SINES = 3
+_FREQUENCY_HZ = (0.05, 0.45)
+_MAX_REDRAWS = 10_000
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrackSpec(PlacingSpec):
+    """Every parameter of ``track``; ``hold_steps`` is how many of the last steps have to be inside.
+
+    Attributes:
+        motion: ``line``, straight at constant speed; ``curve``, a sum of three sines for each axis.
+        speed_m_s: Least and largest speed (m/s): constant on a line, the largest on a curve.
+        acceleration_m_s2: Largest acceleration on a curve (m/s^2).
+    """
+
+    family: ClassVar[str] = "track"
+    further_privileged: ClassVar[Mapping[str, tuple[str, ...]]] = {"goal_velocity": ("x", "y", "z")}
+    plays_on: ClassVar[bool] = False
+
+    motion: Literal["line", "curve"] = scene("line")
+    speed_m_s: tuple[float, float] = scene((0.05, 0.15))
+    acceleration_m_s2: float = scene(0.3)
+    hold_steps: int = 20
+    time_limit_steps: int = 60
+
+    def __post_init__(self) -> None:
+        """Refuse values that make no sense, with a sentence.
+
+        Raises:
+            OptionError: One of them does not.
+        """
+        super().__post_init__()
+        self._check("must be positive", lambda value: value > 0, "acceleration_m_s2")
+        if not 0.0 < self.speed_m_s[0] <= self.speed_m_s[1]:
+            raise OptionError(f"speed_m_s is {self.speed_m_s}; use a least and a larger speed")
+        if self.position_tolerance_mm is None:
+            raise OptionError("track scores the position as a whole; give position_tolerance_mm")
+        if self.hold_steps > self.time_limit_steps:
+            raise OptionError(
+                f"hold_steps is {self.hold_steps}, more than time_limit_steps "
+                f"{self.time_limit_steps}"
+            )
+
+    @property
+    def metrics(self) -> tuple[Metric, ...]:
+        """Errors now; the worst and the mean of the last steps; the share of time inside."""
+        position, tilt = self.position_tolerance_mm, self.tilt_tolerance_deg
+        return (
+            *super().metrics,
+            Metric(WORST_POSITION, "mm", "worst position error", position, over="episode"),
+            Metric(WORST_TILT, "deg", "worst tilt error", tilt, over="episode"),
+            Metric(RMS_POSITION, "mm", "RMS position error", over="episode"),
+            Metric(TIME_INSIDE, "%", "time inside", over="episode"),
+        )
+
+    def instruction(self, scenario: Scenario | None = None) -> str:
+        """The task as one sentence."""
+        return (
+            "Keep the flange centred over the moving target, facing it, "
+            f"{self.standoff_m * 1000:.0f} mm above the surface."
+        )
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class TrackScenario(Scenario):
+    """One scene: the target is at ``centre + velocity t + sum of amplitude sin(omega t + phase)``.
+
+    Attributes:
+        centre: (2,) m, base frame.
+        velocity: (2,) m/s; zero on a curve.
+        amplitude: (3, 2) m; zero on a line.
+        omega: (3, 2) rad/s.
+        phase: (3, 2) rad.
+    """
+
+    centre: FloatArray
+    velocity: FloatArray
+    amplitude: FloatArray
+    omega: FloatArray
+    phase: FloatArray
+
+    def place(self, time_s: FloatArray | float) -> FloatArray:
+        """Where the target is at times (...,) s: (..., 2) m."""
+        time = np.asarray(time_s)[..., None]
+        waves = self.amplitude * np.sin(self.omega * time[..., None] + self.phase)
+        return np.asarray(self.centre + self.velocity * time + waves.sum(axis=-2))
+
+    def speed(self, time_s: FloatArray | float) -> FloatArray:
+        """How fast it moves at times (...,) s: (..., 2) m/s."""
+        time = np.asarray(time_s)[..., None]
+        waves = self.amplitude * self.omega * np.cos(self.omega * time[..., None] + self.phase)
+        return np.asarray(self.velocity + waves.sum(axis=-2))
+
+    def acceleration(self, time_s: FloatArray | float) -> FloatArray:
+        """How fast that changes at times (...,) s: (..., 2) m/s^2."""
+        time = np.asarray(time_s)[..., None, None]
+        waves = self.amplitude * self.omega**2 * np.sin(self.omega * time + self.phase)
+        return np.asarray(-waves.sum(axis=-2))
+
+
+class Track(Placing[TrackSpec, TrackScenario]):
+    """A target that moves over the level table."""
+
+    def draw(self, streams: Streams) -> TrackScenario:
+        """Draw motion, start and look."""
+        from hvs_suite.tasks.shared.start import draw_start
+
+        motion = self._draw_motion(streams)
+        look = draw_look(self.spec, streams)
+        still = TrackScenario(start=np.zeros(7), **motion, **look)
+        first = self.goal_over(*still.place(0.0))
+        own = self.named.start if self.named is not None else "zero"
+        return dataclasses.replace(
+            still, start=draw_start(self.spec, own, streams, first, first.normal)
+        )
+
+    def _draw_motion(self, streams: Streams) -> dict[str, FloatArray]:
+        """Draw motions until one stays on the ring for the whole episode."""
+        spec, random = self.spec, streams.generator("motion")
+        fastest = random.uniform(*spec.speed_m_s)
+        times = np.arange(spec.time_limit_steps + 1) * spec.control_period_s
+        look = draw_look(spec, streams)
+        for _ in range(_MAX_REDRAWS):
+            motion = self._line(random, fastest)
+            if spec.motion == "curve":
+                motion = self._curve(random, fastest, times, look)
+            tried = TrackScenario(start=np.zeros(7), **motion, **look)
+            radius = np.hypot(*tried.place(times).T)
+            if spec.ring_m[0] <= radius.min() and radius.max() <= spec.ring_m[1]:
+                return motion
+        raise OptionError(
+            f"no motion of {spec.time_limit_steps} steps at {fastest:.2f} m/s found that stays "
+            "on the ring; lower speed_m_s or time_limit_steps"
+        )
+
+    def _line(self, random: np.random.Generator, fastest: float) -> dict[str, FloatArray]:
+        heading = random.uniform(-np.pi, np.pi)
+        none = np.zeros((_N_SINES, 2))
+        return {
+            "centre": np.array(self.draw_on_ring(random)),
+            "velocity": fastest * np.array([np.cos(heading), np.sin(heading)]),
+            "amplitude": none,
+            "omega": none,
+            "phase": none,
+        }
+
+    def _curve(
+        self,
+        random: np.random.Generator,
+        fastest: float,
+        times: FloatArray,
+        look: Mapping[str, object],
+    ) -> dict[str, FloatArray]:
+        """Sines of random weight, scaled so that neither speed nor acceleration is exceeded."""
+        motion = {
+            "centre": np.array(self.draw_on_ring(random)),
+            "velocity": np.zeros(2),
+            "amplitude": random.normal(size=(_N_SINES, 2)),
+            "omega": 2.0 * np.pi * random.uniform(*_FREQUENCY_HZ, (_N_SINES, 2)),
+            "phase": random.uniform(-np.pi, np.pi, (_N_SINES, 2)),
+        }
+        # Slow sines sway farther at the same speed.
+        motion["amplitude"] /= motion["omega"]
+        wild = TrackScenario(start=np.zeros(7), **motion, **look)  # type: ignore[arg-type]
+        speed = np.linalg.norm(wild.speed(times), axis=1).max()
+        acceleration = np.linalg.norm(wild.acceleration(times), axis=1).max()
+        motion["amplitude"] *= min(fastest / speed, self.spec.acceleration_m_s2 / acceleration)
+        return motion
+
+    def begin(self, physics: "mjcf.Physics", scenario: TrackScenario) -> None:
+        """Lay the marker where it starts."""
+        super().begin(physics, scenario)
+        self._last: deque[Mapping[str, float]] = deque(maxlen=self.spec.hold_steps)
+        self._n_inside = self._n_counted = 0
+        self.advance(physics, 0.0)
+
+    def advance(self, physics: "mjcf.Physics", time_s: float) -> None:
+        """Move the marker to where it is at a time."""
+        self._time_s = time_s
+        self.put_marker(physics, self.goal())
+
+    def goal(self, ahead_s: float = 0.0) -> Goal:
+        """Over where the target is, or will be."""
+        time_s = self._time_s + ahead_s
+        x, y = self.scenario.place(time_s).tolist()
+        velocity = np.append(self.scenario.speed(time_s), 0.0)
+        return Goal(np.array([x, y, 0.0]), UP, self.spec.standoff_m, velocity)
+
+    def privileged(self) -> dict[str, FloatArray]:
+        """How fast the goal moves, (3,) m/s."""
+        return {"goal_velocity": self.goal().velocity}
+
+    def at_reset(self) -> dict[str, float]:
+        """Nothing counts yet."""
+        return {WORST_POSITION: 0.0, WORST_TILT: 0.0, RMS_POSITION: 0.0, TIME_INSIDE: 0.0}
+
+    def tally(
+        self, physics: "mjcf.Physics", errors: Mapping[str, float], progress: Progress
+    ) -> dict[str, float]:
+        """The worst and the mean of the last steps, and the share of time inside."""
+        self._last.append(errors)
+        if progress.steps > SETTLING_STEPS:
+            self._n_counted += 1
+            self._n_inside += progress.is_inside
+        positions = np.array([each[POSITION] for each in self._last])
+        return {
+            WORST_POSITION: float(positions.max()),
+            WORST_TILT: max(each[TILT] for each in self._last),
+            RMS_POSITION: float(np.sqrt(np.mean(positions**2))),
+            TIME_INSIDE: 100.0 * self._n_inside / max(self._n_counted, 1),
+        }
+
+    def is_complete(self, progress: Progress) -> bool:
+        """Whether the time limit has come, and the last steps all ended inside."""
+        return (
+            progress.steps == self.spec.time_limit_steps
+            and progress.n_inside >= self.spec.hold_steps
+        )
+
+    def steps_to_goal(self, progress: Progress) -> int:
+        """First step of the unbroken hold that made the success."""
+        return progress.steps - progress.n_inside + 1
+
+    @classmethod
+    def certify(cls, env: "Environment", scenarios: Iterable[int]) -> list["Check"]:
+        """The whole path reachable at a moderate speed; observable and accurate at its start."""
+        from hvs_suite.tasks.shared import certificate
+
+        indices = list(scenarios)
+        return [
+            *certificate.check_path(env, indices),
+            *certificate.check_visibility(env, indices),
+            *certificate.check_accuracy(env, indices),
+        ]
+
+
+_LINE = TrackSpec(name="track-line")
+
+register(
+    Track,
+    _LINE,
+    dataclasses.replace(_LINE, name="track-curve", motion="curve"),
+    dataclasses.replace(
+        _LINE,
+        name="track-hard",
+        motion="curve",
+        start="random",
+        target_diameter_m=0.020,
+        tilt_tolerance_deg=0.5,
+        time_limit_steps=80,
+        latency_steps=1,
+        **HARD,
+    ),
+)
