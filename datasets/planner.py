@@ -54,7 +54,6 @@ _PATH_STEP_S = 0.02
 _DISTINCT_RAD = 0.2
 # Ruckig fails on some targets that braking reaches exactly; one beside them will do.
 _NUDGES_RAD = (0.0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3)
-_ITERATIONS = 8
 _LEVEL = 1.0 - 1e-12
 _MEETINGS = 3
 """How often the time is refined at which a moving goal is met: each round halves the error or
@@ -124,8 +123,6 @@ class Planner:
         self._goal_key: bytes = b""
         self._family: FloatArray = np.empty((7, 1))
         """The goal's configurations, one a column; the last is kept free."""
-        self._across: FloatArray = np.empty((2, 3))
-        """Two directions along the goal's surface, (2, 3)."""
         self._floor_m = 0.0
         self._clearance_m = 0.0
         """Of the present state."""
@@ -243,7 +240,6 @@ class Planner:
         if key != self._goal_key:
             self._goal_key = key
             self._soonest_s = math.inf
-            self._across = np.linalg.svd(goal.normal[None])[2][1:]
             family = self._kinematics.goal_configurations_at_tool_angle(
                 goal.position, goal.normal, tool_angle=0.0, n_swivel=self._n_swivel
             )
@@ -374,31 +370,17 @@ class Planner:
         return family.T
 
     def _nearest_posture(self, q: FloatArray, goal: Goal) -> FloatArray | None:
-        """The configuration (7,) of a goal that is nearest to joint angles (7,), by Gauss-Newton.
+        """The configuration (7,) of a goal that is nearest to joint angles (7,), by travel time.
 
         Distances are weighed by the accelerations, as travel times over short ways are. None far
-        from the goal, where the family's one-degree grid is as good, or outside the joint ranges.
+        from the goal, where the family's one-degree grid is as good.
         """
-        a = robot.JOINT_ACCELERATION_RAD_S2
-        posture = q
-        for iteration in range(_ITERATIONS):
-            R, flange = self._kinematics.flange_pose(posture)
-            away = goal.position - flange
-            if iteration == 0 and math.hypot(*away.tolist()) > PROJECTION_RANGE_M:
-                return None
-            # Rotation vector that takes the flange axis onto the inward normal; yaw stays free.
-            across, turn = self._across, _cross(R[:, 2], -goal.normal)
-            error = np.concatenate([away, across @ turn])
-            if np.abs(error).max() < 1e-9:
-                break
-            jacobian = self._kinematics.jacobian(posture)
-            weighted = np.concatenate([jacobian[:3], across @ jacobian[3:]]) * a
-            posture = posture + a * _least_solution(weighted, error)
-        else:
+        _, flange = self._kinematics.flange_pose(q)
+        if math.hypot(*(goal.position - flange).tolist()) > PROJECTION_RANGE_M:
             return None
-        if (np.abs(posture) > robot.JOINT_RANGE_RAD).any() or R[:, 2] @ goal.normal > 0.0:
-            return None
-        return np.asarray(posture)
+        return self._kinematics.nearest_configuration(
+            q, goal.position, goal.normal, robot.JOINT_ACCELERATION_RAD_S2
+        )
 
     def _motion(
         self, q: FloatArray, velocity: FloatArray, goal: FloatArray, *, together: bool = True
@@ -446,16 +428,3 @@ class Planner:
 def _where_braking_ends(q: FloatArray, velocity: FloatArray) -> FloatArray:
     """Where each joint comes to rest (7,) if it brakes as hard as it can."""
     return q + velocity * np.abs(velocity) / (2.0 * robot.JOINT_ACCELERATION_RAD_S2)
-
-
-def _least_solution(A: FloatArray, b: FloatArray) -> FloatArray:
-    """The least x with A x = b as near as can be, leaving out directions that hardly count."""
-    u, s, vt = np.linalg.svd(A, full_matrices=False)
-    # ``np.linalg.pinv`` spends more on its checks than on its work.
-    return np.asarray(np.where(s > 1e-3 * s[0], (b @ u) / s, 0.0) @ vt)
-
-
-def _cross(one: FloatArray, two: FloatArray) -> FloatArray:
-    """Vector product (3,) of two vectors (3,); NumPy's is slow on so few numbers."""
-    (a, b, c), (x, y, z) = one.tolist(), two.tolist()
-    return np.array([b * z - c * y, c * x - a * z, a * y - b * x])

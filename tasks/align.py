@@ -18,7 +18,7 @@ from hvs_suite.tasks.shared.family import register
 from hvs_suite.tasks.shared.goal import Goal
 from hvs_suite.tasks.shared.placing import HARD, Placing, PlacingSpec, is_reachable
 from hvs_suite.tasks.shared.scenario import Scenario, Streams, draw_look
-from hvs_suite.tasks.shared.spec import scene
+from hvs_suite.tasks.shared.spec import Description, in_words, scene
 
 if TYPE_CHECKING:
     from dm_control import mjcf
@@ -59,6 +59,11 @@ class AlignSpec(PlacingSpec):
             raise OptionError(
                 f"goal {self.goal} lies under the robot's base; move it at least 0.1 m away"
             )
+
+    def describe(self) -> Description:
+        """The task in words."""
+        words = super().describe()
+        return dataclasses.replace(words, target=f"{in_words(self.goal)}, {words.target}")
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)

@@ -2,8 +2,8 @@
 
 The thesis's full task. Targets lie on the ring, one at a time. A target vanishes when it was
 reached, or when its time is up, which does not end the episode; the next appears elsewhere. Success
-is to have reached them all. What is hard is that the target is gone at once: a policy has to notice,
-forget the old place and find the new one, which the arm may hide from both cameras.
+is to have reached them all. What is hard is that the target is gone at once: a policy has to
+notice, forget the old place and find the new one, which the arm may hide from both cameras.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from hvs_suite.tasks.shared.goal import Goal
 from hvs_suite.tasks.shared.metric import Metric
 from hvs_suite.tasks.shared.placing import HARD, Placing, PlacingSpec
 from hvs_suite.tasks.shared.scenario import Scenario, Streams, draw_look
-from hvs_suite.tasks.shared.spec import scene
+from hvs_suite.tasks.shared.spec import Description, scene
 
 if TYPE_CHECKING:
     from dm_control import mjcf
@@ -80,6 +80,14 @@ class SequenceSpec(PlacingSpec):
         return (
             "Place the flange centred over one target after the other, facing it, "
             f"{self.standoff_m * 1000:.0f} mm above the surface."
+        )
+
+    def describe(self) -> Description:
+        """The task in words."""
+        words = super().describe()
+        return dataclasses.replace(
+            words,
+            target=f"{self.n_targets} in turn, {self.target_steps} steps each, {words.target}",
         )
 
 

@@ -20,7 +20,7 @@ from hvs_suite.tasks.shared.goal import POSITION, TILT, Goal
 from hvs_suite.tasks.shared.metric import Metric
 from hvs_suite.tasks.shared.placing import HARD, UP, Placing, PlacingSpec
 from hvs_suite.tasks.shared.scenario import Scenario, Streams, draw_look
-from hvs_suite.tasks.shared.spec import scene
+from hvs_suite.tasks.shared.spec import Description, scene
 
 if TYPE_CHECKING:
     from dm_control import mjcf
@@ -97,6 +97,16 @@ class TrackSpec(PlacingSpec):
         return (
             "Keep the flange centred over the moving target, facing it, "
             f"{self.standoff_m * 1000:.0f} mm above the surface."
+        )
+
+    def describe(self) -> Description:
+        """The task in words."""
+        words = super().describe()
+        slowest, fastest = (1000.0 * speed for speed in self.speed_m_s)
+        return dataclasses.replace(
+            words,
+            target=f"on a {self.motion}, {slowest:.0f}-{fastest:.0f} mm/s, {words.target}",
+            held=f"the last {self.hold_steps} steps",
         )
 
 

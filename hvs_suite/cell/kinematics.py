@@ -22,6 +22,7 @@ _UP = (0.0, 0.0, 1.0)
 _SHOULDER = np.array([0.0, 0.0, robot.BASE_TO_SHOULDER_M])
 _SINGULAR = 1e-9
 """Below this sine of A2 or A6 the two axes beside it coincide."""
+_ITERATIONS = 8
 _OFTEN_NEAREST = 4, 7
 """Links that come nearest to each other in most configurations: forearm and hand."""
 # A shape and its mirror image through each of the three pivots: adding pi to the two roll joints
@@ -331,6 +332,36 @@ class Kinematics:
         q[:, 6] = tool_angle
         return _within_ranges(q)
 
+    def nearest_configuration(
+        self, q: FloatArray, position: FloatArray, normal: FloatArray, weight: FloatArray
+    ) -> FloatArray | None:
+        """The configuration of a goal that is nearest to joint angles, by Gauss-Newton.
+
+        Args:
+            q: Joint angles (7,) in rad, not far from the goal.
+            position: Flange face centre (3,) in m.
+            normal: Outward surface normal (3,); yaw about it is free.
+            weight: How readily each joint turns (7,): distances are measured in q / weight.
+
+        Returns:
+            (7,) in rad, or None where the iteration ends outside the joint ranges or nowhere.
+        """
+        across = _across(normal.tobytes())
+        for _ in range(_ITERATIONS):
+            R, flange = self.flange_pose(q)
+            # Rotation vector that takes the flange axis onto the inward normal.
+            error = np.concatenate([position - flange, across @ _cross(R[:, 2], -normal)])
+            if np.abs(error).max() < 1e-9:
+                break
+            jacobian = self.jacobian(q)
+            weighted = np.concatenate([jacobian[:3], across @ jacobian[3:]]) * weight
+            q = q + weight * _least_solution(weighted, error)
+        else:
+            return None
+        if (np.abs(q) > robot.JOINT_RANGE_RAD).any() or R[:, 2] @ normal > 0.0:
+            return None
+        return np.asarray(q)
+
     def _shapes(
         self, position: npt.ArrayLike, normal: npt.ArrayLike, swivel: FloatArray
     ) -> FloatArray:
@@ -370,6 +401,25 @@ class Kinematics:
         q[:, 4], q[:, 5], q[:, 6] = _zyz_angles(R_wrist)
         shapes = _BRANCH_SIGN[:, None, :] * q + _BRANCH_SHIFT[:, None, :]
         return _wrap(shapes.reshape(-1, 7))
+
+
+@functools.lru_cache(maxsize=256)
+def _across(normal: bytes) -> FloatArray:
+    """Two directions (2, 3) along a surface, from the bytes of its normal (3,)."""
+    return np.asarray(np.linalg.svd(np.frombuffer(normal)[None])[2][1:])
+
+
+def _least_solution(A: FloatArray, b: FloatArray) -> FloatArray:
+    """The least x with A x = b as near as can be, leaving out directions that hardly count."""
+    u, s, vt = np.linalg.svd(A, full_matrices=False)
+    # ``np.linalg.pinv`` spends more on its checks than on its work.
+    return np.asarray(np.where(s > 1e-3 * s[0], (b @ u) / s, 0.0) @ vt)
+
+
+def _cross(one: FloatArray, two: FloatArray) -> FloatArray:
+    """Vector product (3,) of two vectors (3,); NumPy's is slow on so few numbers."""
+    (a, b, c), (x, y, z) = one.tolist(), two.tolist()
+    return np.array([b * z - c * y, c * x - a * z, a * y - b * x])
 
 
 def _circle(n: int) -> FloatArray:

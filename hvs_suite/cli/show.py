@@ -9,7 +9,6 @@ import numpy.typing as npt
 import tyro
 
 from hvs_suite.cli import console
-from hvs_suite.cli.tasks import disturbances, tolerance
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -125,6 +124,7 @@ def draw(
     """
     from matplotlib.figure import Figure
 
+    words = variant.describe()
     table_in = ROW_IN * (len(certificate.checks) + 2)
     head_in, gap_in, edge_in = 1.2, 0.45, 0.25
     height = head_in + 2 * (PANEL_IN + gap_in) + table_in + edge_in
@@ -137,18 +137,17 @@ def draw(
     put_text(
         edge_in,
         0.62,
-        f"to reach: {tolerance(variant)}"
-        + (f", held {variant.hold_steps} steps" if variant.hold_steps > 1 else "")
+        f"to reach: {words.tolerance}"
+        + (f", held {words.held}" if words.held else "")
         + f", within {variant.time_limit_steps} steps of {variant.control_period_s:g} s",
         size=10,
         color=FAINT,
     )
-    varied = disturbances(variant)
+    varied = words.disturbances
     put_text(
         edge_in,
         0.84,
-        f"start {variant.start}, goal {variant.goal}, "
-        f"{variant.target_diameter_m * 1000:.0f} mm {variant.marker}; "
+        f"start {words.start}; target: {words.target}; "
         f"disturbed: {'nothing' if varied == '-' else varied}; shown: test scenario {scenario}",
         size=10,
         color=FAINT,

@@ -73,9 +73,8 @@ def describe(episode: "Episode", policy: str) -> str:
         how = f"collision in step {episode.steps}"
     else:
         how = f"time is up after {episode.steps} steps"
-    return (
-        f"{policy}, scenario {episode.scenario}: {how}; "
-        f"{episode.position_error_mm:.2f} mm and {episode.tilt_error_deg:.2f} deg off"
+    return f"{policy}, scenario {episode.scenario}: {how}; , ".join(
+        f"{name} {value:.2f}" for name, value in episode.errors.items()
     )
 
 

@@ -113,7 +113,7 @@ class ResidualStage(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._shaping = shaping
         self._gamma = gamma
         self._environment: Any = env.unwrapped.environment  # type: ignore[attr-defined]
-        self._tolerances = self._environment.variant.tolerances
+        self._bounds = self._environment.variant.step_bounds
         self._memory: torch.Tensor | None = None
         self._out: torch.Tensor | None = None
         self._state: torch.Tensor | None = None
@@ -152,7 +152,7 @@ class ResidualStage(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self._look(observation), reward, terminated, truncated, info
 
     def _phi(self, info: Mapping[str, Any]) -> float:
-        errors = [info[name] / bound for name, bound in self._tolerances.items()]
+        errors = [info["errors"][name] / bound for name, bound in self._bounds.items()]
         return -self._shaping * float(np.arcsinh(errors).sum())
 
     def _look(self, observation: Mapping[str, npt.NDArray[Any]]) -> Observation:

@@ -34,8 +34,7 @@ class Evaluation:
         length: Control steps.
         success_rate: Share that reached the goal.
         collision_rate: Share that ended in a forbidden contact.
-        position_error_mm: At the end of the episode (mm).
-        tilt_error_deg: At the end of the episode (deg).
+        errors: The task's metrics at the end of the episode.
     """
 
     env_steps: int
@@ -45,20 +44,20 @@ class Evaluation:
     length: float
     success_rate: float
     collision_rate: float
-    position_error_mm: float
-    tilt_error_deg: float
+    errors: dict[str, float]
 
     def figures(self) -> dict[str, float]:
         """What goes on the board, by name."""
-        names = [field.name for field in dataclasses.fields(self)][3:]
-        return {name: float(getattr(self, name)) for name in names}
+        names = [field.name for field in dataclasses.fields(self)][3:-1]
+        return {name: float(getattr(self, name)) for name in names} | self.errors
 
     def in_words(self) -> str:
         """The figures as one line."""
+        errors = ", ".join(f"{name} {value:.3g}" for name, value in self.errors.items())
         return (
             f"return {self.episode_return:.2f} in {self.length:.1f} steps, success "
             f"{100 * self.success_rate:.0f} %, collisions {100 * self.collision_rate:.0f} %, "
-            f"{self.position_error_mm:.3g} mm and {self.tilt_error_deg:.2g} deg off"
+            f"{errors}"
         )
 
 
@@ -116,8 +115,10 @@ class Examiner:
             length=float(np.mean([episode.steps for episode in played])),
             success_rate=float(np.mean([episode.success for episode in played])),
             collision_rate=float(np.mean([episode.collision for episode in played])),
-            position_error_mm=float(np.mean([episode.position_error_mm for episode in played])),
-            tilt_error_deg=float(np.mean([episode.tilt_error_deg for episode in played])),
+            errors={
+                name: float(np.mean([episode.errors[name] for episode in played]))
+                for name in played[0].errors
+            },
         )
 
     def close(self) -> None:

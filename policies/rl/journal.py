@@ -20,14 +20,7 @@ from hvs_suite.tasks.shared.spec import Spec
 
 SCENES_A_SEED = 10**9
 """Runs with different seeds learn from different scenes."""
-OUTCOMES = (
-    "is_success",
-    "collision",
-    "position_error_mm",
-    "lateral_error_mm",
-    "height_error_mm",
-    "tilt_error_deg",
-)
+OUTCOMES = ("is_success", "collision", "errors")
 """What SB3's monitor keeps of the end of an episode, besides return ``r`` and length ``l``."""
 
 

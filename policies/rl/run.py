@@ -308,8 +308,9 @@ class Run:
         """Points of all curves: SB3's own, and what it does not know of our episodes."""
         model = self._model
         recent = list(model.ep_info_buffer or ())
-        for name in OUTCOMES if recent else ():
-            value = sum(float(episode[name]) for episode in recent) / len(recent)
+        ends = [{**episode, **episode["errors"]} for episode in recent]
+        for name in (*OUTCOMES[:-1], *recent[0]["errors"]) if recent else ():
+            value = sum(float(end[name]) for end in ends) / len(ends)
             model.logger.record(f"rollout/{name}", value)
         model.logger.record(
             "train/updates_per_env_step", model._n_updates / max(1, model.num_timesteps)

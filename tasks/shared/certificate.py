@@ -9,16 +9,17 @@ filtered: a task that fails is changed instead.
 
 import dataclasses
 import importlib.resources
+import itertools
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.cell.kinematics import kinematics, travel_time
-from hvs_suite.cell.robot import JOINT_RANGE_RAD
+from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
 from hvs_suite.tasks.shared.detection import find_disc
 from hvs_suite.tasks.shared.goal import Goal
 from hvs_suite.tasks.shared.start import steps_lower_bound
@@ -34,6 +35,8 @@ MAX_BUDGET = 0.8
 """Share of a tolerance that disturbances may use up."""
 CONTROL_RESIDUAL_MM = 0.02
 """Standing error of the joint controller, an upper bound that the cell's tests hold."""
+MAX_SPEED_SHARE = 0.6
+"""Share of a joint's speed that following a moving goal may need."""
 _PERCENTILE = 99
 # Postures that clear the line of sight: lean the arm by A2 in one of eight directions of A1.
 _LOOK_LEAN_RAD = (0.25, 0.5, 0.75)
@@ -123,12 +126,7 @@ def check_geometry(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
     env.draws = True
     limit = spec.time_limit_steps
     return [
-        Check(
-            "reachable: least margin to a joint stop, best posture",
-            f"{min(margins):.1f} deg",
-            f">= {MIN_JOINT_MARGIN_DEG:g} deg",
-            min(margins) >= MIN_JOINT_MARGIN_DEG,
-        ),
+        _margin_check(min(margins)),
         Check(
             "in time: steps of the fastest motion, hold and latency included",
             f"mean {np.mean(bounds):.1f}, max {max(bounds)}",
@@ -136,6 +134,136 @@ def check_geometry(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
             max(bounds) <= limit,
         ),
     ]
+
+
+def check_legs(
+    env: "Environment", scenarios: Iterable[int], targets: Callable[[Any], FloatArray]
+) -> list[Check]:
+    """Is every one of several targets reachable with margin, and in time from the one before?
+
+    The time of a leg is the least travel time between any two postures at its ends: a lower bound.
+
+    Args:
+        env: The named task, a family of `Placing` with targets on the level surface.
+        scenarios: Indices to check.
+        targets: Centres of a scenario's targets in their order, (n, 3) m.
+
+    Returns:
+        Checks of the joint margin, of the slowest leg and of their sum.
+    """
+    spec, family = env.variant, env.task.family
+    margins, legs, sums = [], [], []
+    for index in scenarios:
+        scenario = env.task.source.draw(index)
+        goals = [family.goal_over(x, y) for x, y, _ in targets(scenario).tolist()]
+        margins += [joint_margin_deg(goal) for goal in goals]
+        steps = [steps_lower_bound(spec, scenario.start, goals[0])]
+        postures = [
+            kinematics().goal_configurations_at_tool_angle(goal.position, goal.normal, 0.0, 24)
+            for goal in goals
+        ]
+        for here, there in itertools.pairwise(postures):
+            seconds = min(
+                float(travel_time(q, there, acceleration_limits=True).min()) for q in here
+            )
+            steps.append(
+                math.ceil(seconds / spec.control_period_s - 1e-9)
+                + spec.hold_steps
+                - 1
+                + spec.latency_steps
+            )
+        legs += steps
+        sums.append(sum(steps))
+    return [
+        _margin_check(min(margins)),
+        Check(
+            "in time: steps of the slowest leg at its fastest, hold and latency included",
+            f"mean {np.mean(legs):.1f}, max {max(legs)}",
+            f"<= {spec.target_steps}",
+            max(legs) <= spec.target_steps,
+        ),
+        Check(
+            "in time: steps of all legs at their fastest",
+            f"mean {np.mean(sums):.1f}, max {max(sums)}",
+            f"<= {spec.time_limit_steps}",
+            max(sums) <= spec.time_limit_steps,
+        ),
+    ]
+
+
+def check_path(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
+    """Can the arm stay with a moving goal: within its ranges, well below its speeds, in time?
+
+    A posture at the start of the path is carried along it, each time to the nearest one. The
+    soonest that keeps the bounds is taken; where none does, the one that needs the least speed.
+
+    Args:
+        env: The named task.
+        scenarios: Indices to check.
+
+    Returns:
+        Checks of the joint margin along the path, of the joint speeds and of the time to get there.
+    """
+    spec, model = env.variant, kinematics()
+    margins, shares, bounds = [], [], []
+    env.draws = False
+    for index in scenarios:
+        env.reset(scenario=index)
+        task = env.task
+        goals = [task.goal(k * spec.control_period_s) for k in range(spec.time_limit_steps + 1)]
+        first = goals[0]
+        family = model.goal_configurations_at_tool_angle(first.position, first.normal, 0.0, 24)
+        times = travel_time(env.scenario.start, family, acceleration_limits=True)
+        margin, share = -math.inf, math.inf
+        for q in family[np.argsort(times)]:
+            found = _carry(q, goals, spec.control_period_s)
+            if found[1] < share:
+                margin, share = found
+            if margin >= MIN_JOINT_MARGIN_DEG and share <= MAX_SPEED_SHARE:
+                break
+        margins.append(margin)
+        shares.append(share)
+        bounds.append(steps_lower_bound(spec, env.scenario.start, first))
+    env.draws = True
+    latest = spec.time_limit_steps
+    return [
+        _margin_check(min(margins)),
+        Check(
+            "followed: largest joint speed along the path, of what the joint can do",
+            f"median {100 * np.median(shares):.0f} %, max {100 * max(shares):.0f} %",
+            f"<= {100 * MAX_SPEED_SHARE:.0f} %",
+            max(shares) <= MAX_SPEED_SHARE,
+        ),
+        Check(
+            "in time: steps of the fastest motion to where it starts, hold and latency included",
+            f"mean {np.mean(bounds):.1f}, max {max(bounds)}",
+            f"<= {latest}",
+            max(bounds) <= latest,
+        ),
+    ]
+
+
+def _carry(q: FloatArray, goals: Sequence[Goal], period_s: float) -> tuple[float, float]:
+    """Least margin to a joint stop (deg) and largest share of a joint's speed along a path."""
+    margin, share = math.inf, 0.0
+    for goal in goals:
+        near = kinematics().nearest_configuration(q, goal.position, goal.normal, JOINT_SPEED_RAD_S)
+        if near is None:
+            return -math.inf, math.inf
+        if margin < math.inf:
+            share = max(share, float((np.abs(near - q) / JOINT_SPEED_RAD_S).max()) / period_s)
+        margin = min(margin, float(np.rad2deg((JOINT_RANGE_RAD - np.abs(near)).min())))
+        q = near
+    return margin, share
+
+
+def _margin_check(margin_deg: float) -> Check:
+    return Check(
+        "reachable: least margin to a joint stop, best posture",
+        f"{margin_deg:.1f} deg",
+        f">= {MIN_JOINT_MARGIN_DEG:g} deg",
+        margin_deg >= MIN_JOINT_MARGIN_DEG,
+    )
 
 
 def check_visibility(env: "Environment", scenarios: Iterable[int]) -> list[Check]:

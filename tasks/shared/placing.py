@@ -27,7 +27,7 @@ from hvs_suite.tasks.shared.goal import (
 )
 from hvs_suite.tasks.shared.metric import Metric
 from hvs_suite.tasks.shared.scenario import Scenario
-from hvs_suite.tasks.shared.spec import Spec, scene
+from hvs_suite.tasks.shared.spec import Description, Spec, scene
 
 if TYPE_CHECKING:
     from dm_control import mjcf
@@ -120,6 +120,21 @@ class PlacingSpec(Spec):
             Metric(LATERAL, "mm", "lateral error", self.lateral_tolerance_mm),
             Metric(HEIGHT, "mm", "height error", self.height_tolerance_mm),
             Metric(TILT, "deg", "tilt error", self.tilt_tolerance_deg),
+        )
+
+    def describe(self) -> Description:
+        """The task in words."""
+        parts = []
+        if self.position_tolerance_mm is not None:
+            parts.append(f"{self.position_tolerance_mm:g} mm")
+        if self.lateral_tolerance_mm is not None:
+            parts.append(f"{self.lateral_tolerance_mm:g} mm sideways")
+        if self.height_tolerance_mm is not None:
+            parts.append(f"{self.height_tolerance_mm:g} mm in height")
+        return dataclasses.replace(
+            super().describe(),
+            target=f"{self.target_diameter_m * 1000:.0f} mm {self.marker}",
+            tolerance=", ".join([*parts, f"{self.tilt_tolerance_deg:g} deg"]),
         )
 
     @property

@@ -134,6 +134,27 @@ class Disturbances:
     joint_offset_deg: float = scene(0.0)
 
 
+@dataclasses.dataclass(frozen=True)
+class Description:
+    """A task in words, for tables, cards and pictures.
+
+    Attributes:
+        start: How the arm starts.
+        target: What it goes to.
+        tolerance: Bounds of a success, such as ``1 mm, 1 deg``.
+        held: For how long they have to be kept; empty for a single control step.
+        time: How much time there is.
+        disturbances: What else differs from scenario to scenario; a dash for nothing.
+    """
+
+    start: str
+    target: str
+    tolerance: str
+    held: str
+    time: str
+    disturbances: str
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Spec(Timing, Cameras, Disturbances):
     """Every parameter of a task; families add their own.
@@ -270,7 +291,7 @@ class Spec(Timing, Cameras, Disturbances):
 
     @property
     def step_bounds(self) -> dict[str, float]:
-        """Bounds on the step metrics: a control step that ends inside all of them counts as held."""
+        """Bounds on the step metrics: a control step that ends inside all of them is held."""
         return {
             metric.name: metric.bound
             for metric in self.metrics
@@ -290,6 +311,31 @@ class Spec(Timing, Cameras, Disturbances):
             scenario: For tasks whose sentence depends on it; None for the sentence that fits all.
         """
         raise NotImplementedError
+
+    def describe(self) -> Description:
+        """The task in words: the one place that phrases tolerances and disturbances."""
+        bounds = [
+            f"{metric.bound:g} {metric.unit} {metric.title.removesuffix(' error')}"
+            for metric in self.metrics
+            if metric.over == "step" and metric.bound is not None
+        ]
+        present = {
+            "light": self.vary_light,
+            "colour": self.vary_colour,
+            "texture": self.vary_texture,
+            "ETH pose": self.eth_position_noise_m > 0 or self.eth_rotation_noise_deg > 0,
+            "image noise": self.image_noise > 0,
+            "joint offsets": self.joint_offset_deg > 0,
+            "latency": self.latency_steps > 0,
+        }
+        return Description(
+            start=in_words(self.start),
+            target="goal",
+            tolerance=", ".join(bounds),
+            held=f"{self.hold_steps} steps" if self.hold_steps > 1 else "",
+            time=f"{self.time_limit_steps} x {self.control_period_s:g} s",
+            disturbances=", ".join(name for name, there in present.items() if there) or "-",
+        )
 
     @property
     def reach_m(self) -> float:
@@ -334,6 +380,13 @@ class Spec(Timing, Cameras, Disturbances):
 
 
 CAMERA_NAMES = ("eih", "eth")
+
+
+def in_words(choice: object) -> str:
+    """An option as text; numbers as a list."""
+    if isinstance(choice, tuple):
+        return "(" + ", ".join(f"{number:g}" for number in choice) + ")"
+    return str(choice)
 
 
 def observation_names(observations: str) -> tuple[str, ...]:
