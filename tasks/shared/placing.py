@@ -167,10 +167,15 @@ class Placing[S: PlacingSpec, C: Scenario](Family[S, C]):
 
     def put_marker(self, physics: "mjcf.Physics", goal: Goal) -> None:
         """Lay the marker where a goal's target is."""
+        import mujoco
+
         from hvs_suite.cell.marker import orientation
 
-        physics.data.ptr.mocap_pos[self._mocap] = goal.target
-        physics.data.ptr.mocap_quat[self._mocap] = orientation(goal.normal)
+        model, data = physics.model.ptr, physics.data.ptr
+        data.mocap_pos[self._mocap] = goal.target
+        data.mocap_quat[self._mocap] = orientation(goal.normal)
+        # The picture that follows shows where bodies were computed to be.
+        mujoco.mj_kinematics(model, data)
 
     def measure(self, tip: Tip) -> dict[str, float]:
         """Errors of the tip to the present goal; see `goal_errors`."""

@@ -16,13 +16,13 @@ from hvs_suite.errors import PolicyError
 from hvs_suite.policies.catalogue import policy_factory
 from hvs_suite.policies.context import Blindfolded, PolicyContext
 from hvs_suite.policies.servo import Belief, make_servo
-from hvs_suite.policies.target_estimate import (
+from hvs_suite.policies.servo.target_estimate import (
     DISC_PLANE_M,
     Sighting,
     TargetEstimate,
     intersect,
 )
-from hvs_suite.policies.target_search import TargetSearch
+from hvs_suite.policies.servo.target_search import TargetSearch
 from hvs_suite.rollout import run_episode
 from hvs_suite.tasks.shared.spec import TASKS
 

@@ -21,7 +21,7 @@ A decision is:
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -34,17 +34,17 @@ from hvs_suite.cell.robot import (
     JOINT_RANGE_RAD,
     SHOULDER_TO_ELBOW_M,
     WRIST_TO_FLANGE_M,
-    after_commands,
-    set_point_after,
 )
 from hvs_suite.datasets.planner import Planner
 from hvs_suite.errors import PolicyError
-from hvs_suite.policies.target_estimate import Sight, Sighting, TargetEstimate
-from hvs_suite.policies.target_search import SPACING_M, TargetSearch
+from hvs_suite.policies.servo.belief import Belief
+from hvs_suite.policies.servo.target_estimate import Sight, Sighting, TargetEstimate
+from hvs_suite.policies.servo.target_search import SPACING_M, TargetSearch
 from hvs_suite.rollout import Observation
 from hvs_suite.tasks.shared.detection import find_discs
 from hvs_suite.tasks.shared.goal import Goal
-from hvs_suite.tasks.shared.spec import Spec, observation_names
+from hvs_suite.tasks.shared.placing import PlacingSpec
+from hvs_suite.tasks.shared.spec import observation_names
 
 if TYPE_CHECKING:
     pass
@@ -58,99 +58,17 @@ _VIEW_SHARE = 0.9
 """Share of the eye-in-hand camera's half view that the target has to lie within."""
 _SIGMAS = 3.0
 _SETTLED_SIGMA_M = 0.003
-_MAX_MISSES = 6
-_MAX_LATENCY = 3
-_MOVED_SHARE = 0.1
-"""A first move of less than this share of the commanded one is still to come."""
 _REACH_MARGIN_M = 0.0005
 _SHORTEST_REACH_M = 0.402
 """Least distance of wrist and shoulder, A4 at its limit of 120 deg."""
 _LOOK_CHOICES = 12
 
 
-class Playground(Protocol):
-    """What the policy takes of an environment: the task's parameters, nothing else."""
-
-    @property
-    def variant(self) -> Spec:
-        """The task's parameters."""
-
-
-class Belief:
-    """The arm's state as the policy can know it.
-
-    Set points are remembered rather than seen: they move towards each command within the joint
-    speed limits. Whether commands act at once or a control step later shows in when the arm first
-    moves.
+class StillTargetServo:
+    """Servoes one still target; follows :class:`hvs_suite.rollout.Policy`.
 
     Attributes:
-        variant: The task's parameters.
-        joint_positions: Measured, (7,) rad.
-        joint_velocities: Measured, (7,) rad/s.
-    """
-
-    def __init__(self, variant: Spec) -> None:
-        self.variant = variant
-        self.joint_positions: FloatArray = np.zeros(7)
-        self.joint_velocities: FloatArray = np.zeros(7)
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget the last episode."""
-        self._start: FloatArray | None = None
-        self._commands: list[FloatArray] = []
-        self._latency = 0
-        self._has_moved = False
-
-    def measure(self, positions: FloatArray, velocities: FloatArray) -> None:
-        """Take in measured joint angles (7,) rad and speeds (7,) rad/s."""
-        self.joint_positions = positions
-        self.joint_velocities = velocities
-        if self._start is None:
-            self._start = positions
-        if self._commands and not self._has_moved:
-            # The commands so far, had they acted at once, would have moved the set point so far.
-            way = np.abs(self._tracked(self._commands) - self._start).max()
-            moved = np.abs(positions - self._start).max()
-            if moved > _MOVED_SHARE * way:
-                self._has_moved = True
-            else:
-                self._latency = min(len(self._commands), _MAX_LATENCY)
-
-    def command(self, action: npt.NDArray[np.float32]) -> None:
-        """Remember an action, (7,) in [-1, 1]."""
-        self._commands.append(action.astype(np.float64) * JOINT_RANGE_RAD)
-
-    @property
-    def setpoint(self) -> FloatArray:
-        """Set point that the controller tracks now, (7,) rad."""
-        return self._tracked(self._commands[: len(self._commands) - self._latency])
-
-    @property
-    def pending_setpoints(self) -> list[FloatArray]:
-        """Set points commanded that do not act yet, oldest first."""
-        return self._commands[len(self._commands) - self._latency :]
-
-    def when_action_acts(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Joint angles (rad), speeds (rad/s) and set point (rad), (7,) each, at that moment."""
-        return after_commands(
-            self.joint_positions,
-            self.joint_velocities,
-            self.setpoint,
-            self.pending_setpoints,
-            self.variant.control_period_s,
-        )
-
-    def _tracked(self, commands: list[FloatArray]) -> FloatArray:
-        assert self._start is not None
-        set_point = self._start
-        for command in commands:
-            set_point = set_point_after(set_point, command, self.variant.control_period_s)
-        return set_point
-
-
-class Servo:
-    """The policy; follows :class:`hvs_suite.rollout.Policy`.
+        max_misses: How often the eye in the hand may miss a target that it should see.
 
     Args:
         variant: The task's parameters.
@@ -159,11 +77,13 @@ class Servo:
         PolicyError: The task needs what this method does not do.
     """
 
-    def __init__(self, variant: Spec) -> None:
+    max_misses = 6
+
+    def __init__(self, variant: PlacingSpec) -> None:
         _check(variant)
         self._variant = variant
         self._kinematics = kinematics()
-        self._belief = Belief(variant)
+        self._belief = Belief(variant.control_period_s)
         self._planner = Planner(variant.control_period_s)
         self._sight = Sight(variant.target_diameter_m, variant.ring_m)
         self._search = TargetSearch(self._kinematics, variant.ring_m, variant.target_diameter_m)
@@ -201,12 +121,16 @@ class Servo:
         q = np.asarray(observation["joint_positions"], np.float64)
         self._belief.measure(q, np.asarray(observation["joint_velocities"], np.float64))
         self._perceive(observation, q)
-        goal, onward = self._aim(q)
-        angles, speeds, _ = self._belief.when_action_acts()
-        target = self._planner.next_set_point(angles, speeds, goal, onward=onward)
+        target = self._next_set_point(q)
         action = np.clip(target / JOINT_RANGE_RAD, -1.0, 1.0).astype(np.float32)
         self._belief.command(action)
         return action
+
+    def _next_set_point(self, q: FloatArray) -> FloatArray:
+        """Where the set point (7,) shall be at the end of the control step."""
+        goal, onward = self._aim(q)
+        angles, speeds, _ = self._belief.when_action_acts()
+        return self._planner.next_set_point(angles, speeds, goal, onward=onward)
 
     # --- seeing ---------------------------------------------------------------------------------
 
@@ -232,11 +156,15 @@ class Servo:
             if seen_eth is not None:
                 self._estimate.see_eth(seen_eth)
         if not self._estimate.is_known:
-            if self._has_eih:
-                self._search.rule_out(q, self._eih_K, T, self._variant.eih_resolution, own=True)
-            if self._has_eth:
-                side = self._variant.eth_resolution
-                self._search.rule_out(q, self._eth_K, self._eth_T, side, own=False)
+            self._rule_out(q, T)
+
+    def _rule_out(self, q: FloatArray, T: FloatArray) -> None:
+        """Neither camera saw a target: it lies in no place that they see."""
+        if self._has_eih:
+            self._search.rule_out(q, self._eih_K, T, self._variant.eih_resolution, own=True)
+        if self._has_eth:
+            side = self._variant.eth_resolution
+            self._search.rule_out(q, self._eth_K, self._eth_T, side, own=False)
 
     def _sighting(self, image: npt.NDArray[Any], K: FloatArray, T: FloatArray) -> Sighting | None:
         """The first patch of a picture that can be the target."""
@@ -251,34 +179,50 @@ class Servo:
         if not self._estimate.is_known:
             return
         place, _ = self._estimate.place()
-        x, y, depth = T[:3, :3] @ [*place, 0.0] + T[:3, 3]
-        if depth <= 0.02 or max(abs(x), abs(y)) > self._half_view * depth:
+        if not self._should_be_seen(T, place):
             return
         self._misses += 1
-        if self._misses > _MAX_MISSES:
-            self._estimate = TargetEstimate(self._eth_sigma_m)
-            self._search.reset()
-            self._look, self._misses = None, 0
+        if self._misses > self.max_misses:
+            self._start_over()
+
+    def _should_be_seen(self, T: FloatArray, place: FloatArray) -> bool:
+        """Whether a target at a place (2,) is in the eye in the hand's view, extrinsics (4, 4)."""
+        x, y, depth = T[:3, :3] @ [*place, 0.0] + T[:3, 3]
+        return bool(depth > 0.02 and max(abs(x), abs(y)) <= self._half_view * depth)
+
+    def _start_over(self) -> None:
+        """Forget where the target was: it is not there."""
+        self._estimate = TargetEstimate(self._eth_sigma_m)
+        self._search.reset()
+        self._look, self._misses = None, 0
 
     # --- going ----------------------------------------------------------------------------------
 
     def _aim(self, q: FloatArray) -> tuple[Goal, Goal | None]:
         """Decide where the flange shall go, and where it goes next if it only hovers there."""
         if not self._estimate.is_known:
-            return _facing_down(self._look_out(q)), None
+            return facing_down(self._look_out(q)), None
         place, sigma = self._estimate.place()
         standoff, surface = self._variant.standoff_m, self._estimate.surface_m
         # Misplaced by a few millimetres, a target at the edge would be out of reach.
-        goal = _within_reach(np.array([*place, standoff + surface]))
+        goal = within_reach(np.array([*place, standoff + surface]))
+        height = self._height_to_see(sigma)
+        if height == standoff:
+            return facing_down(goal), None
+        hover = np.array([*place, min(height, _MAX_HOVER_M) + surface])
+        return facing_down(within_reach(hover)), facing_down(goal)
+
+    def _height_to_see(self, sigma_m: float) -> float:
+        """How far above the surface the eye in the hand is sure to see the target (m).
+
+        Args:
+            sigma_m: Standard deviation of the target's place (m).
+        """
         needed = 0.0
         if self._has_eih:
-            radius = 0.5 * self._variant.target_diameter_m + _SIGMAS * sigma
+            radius = 0.5 * self._variant.target_diameter_m + _SIGMAS * sigma_m
             needed = radius / self._half_view
-        height = max(standoff, needed) * (1.0 + 0.3 * self._misses)
-        if height == standoff:
-            return _facing_down(goal), None
-        hover = np.array([*place, min(height, _MAX_HOVER_M) + surface])
-        return _facing_down(_within_reach(hover)), _facing_down(goal)
+        return max(self._variant.standoff_m, needed) * (1.0 + 0.3 * self._misses)
 
     def _look_out(self, q: FloatArray) -> FloatArray:
         """Where to hover to look at what nobody has looked at, (3,) m.
@@ -294,7 +238,7 @@ class Servo:
         choices = hidden[np.unique(np.linspace(0, len(hidden) - 1, _LOOK_CHOICES).astype(int))]
         for choice in choices:
             covered = hidden[_near(hidden, choice, radius)]
-            goal = _within_reach(np.array([*covered[:, :2].mean(axis=0), _LOOK_HEIGHT_M]))
+            goal = within_reach(np.array([*covered[:, :2].mean(axis=0), _LOOK_HEIGHT_M]))
             family = self._kinematics.goal_configurations_at_tool_angle(goal, _UP, q[6])
             if not len(family):
                 continue
@@ -303,7 +247,7 @@ class Servo:
             if worth > best:
                 best, self._look = worth, goal
         if self._look is None:
-            self._look = _within_reach(np.array([*choices[0, :2], _LOOK_HEIGHT_M]))
+            self._look = within_reach(np.array([*choices[0, :2], _LOOK_HEIGHT_M]))
         return self._look
 
 
@@ -313,12 +257,12 @@ def _near(points: FloatArray, place: FloatArray, radius: float) -> npt.NDArray[n
     return np.asarray(np.hypot(*(points[:, :2] - place[:2]).T) < inner)
 
 
-def _facing_down(position: FloatArray) -> Goal:
+def facing_down(position: FloatArray) -> Goal:
     """The goal of the flange at a place (3,) m over the table, facing straight down."""
     return Goal(np.array([position[0], position[1], 0.0]), _UP, float(position[2]))
 
 
-def _within_reach(goal: FloatArray) -> FloatArray:
+def within_reach(goal: FloatArray) -> FloatArray:
     """The nearest place at the same height over which the arm can face down, (3,) m."""
     rise = goal[2] + WRIST_TO_FLANGE_M - BASE_TO_SHOULDER_M
     longest = SHOULDER_TO_ELBOW_M + ELBOW_TO_WRIST_M - _REACH_MARGIN_M
@@ -329,14 +273,14 @@ def _within_reach(goal: FloatArray) -> FloatArray:
     return np.array([goal[0] * scale, goal[1] * scale, goal[2]])
 
 
-def _calibration_sigma(variant: Spec) -> float:
+def _calibration_sigma(variant: PlacingSpec) -> float:
     """What the published accuracy of the eye-to-hand calibration means on the surface (m)."""
     distance = float(np.linalg.norm(np.subtract(variant.eth_position_m, variant.eth_look_at_m)))
     turn = np.radians(variant.eth_rotation_noise_deg)
     return float(np.hypot(variant.eth_position_noise_m, distance * turn))
 
 
-def _check(variant: Spec) -> None:
+def _check(variant: PlacingSpec) -> None:
     """Refuse what the method does not do, in a sentence."""
     names = observation_names(variant.observations)
     if not {"eih", "eth"} & set(names) or not {"joint_positions", "joint_velocities"} <= set(names):
@@ -350,10 +294,5 @@ def _check(variant: Spec) -> None:
         for name, channels in (("eih", variant.eih_channels), ("eth", variant.eth_channels))
     ):
         raise PolicyError("servo tells the target by its colour; use cameras with 3 channels")
-    if variant.surface != "flat" or variant.marker != "disc":
+    if getattr(variant, "surface", "flat") != "flat" or variant.marker != "disc":
         raise PolicyError("servo knows discs on flat surfaces alone")
-
-
-def make_servo(env: Playground) -> Servo:
-    """The policy for an environment, of which it takes the parameters alone."""
-    return Servo(env.variant)
