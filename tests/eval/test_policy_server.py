@@ -20,7 +20,14 @@ from websockets.sync.server import serve
 import hvs_suite
 from hvs_suite.cli import main
 from hvs_suite.errors import OptionError, PolicyError, ServerError
-from hvs_suite.eval import policy_server, protocol, remote_policy, result_file, wire
+from hvs_suite.eval import (
+    policy_server,
+    policy_session,
+    protocol,
+    remote_policy,
+    result_file,
+    wire,
+)
 from hvs_suite.rollout import run_episode
 
 TASK = "align-thesis"
@@ -53,7 +60,7 @@ def conversation(policy: str) -> Callable[[Any], None]:
     """The reference server's conversation, without the process around it."""
 
     def talk(websocket: Any) -> None:
-        session = policy_server.Session(policy)
+        session = policy_session.Session(policy)
         for message in websocket:
             websocket.send(session.answer(message))
 
@@ -120,7 +127,7 @@ def test_a_served_policy_knows_of_the_task_what_it_knows_in_process() -> None:
         assert evaluate(url, 1).summary.failures == {}
     with hvs_suite.load(TASK) as env:
         message = msgpack.unpackb(wire.encode(remote_policy.hello(TASK, env)))
-        _, context = policy_server.served("servo", TASK, message)
+        _, context = policy_session.served("servo", TASK, message)
         assert context.observations == dict(env.observation_spec())
         assert context.action == env.action_spec()
         assert context.variant == env.variant
@@ -268,7 +275,7 @@ def hello(**changed: Any) -> dict[str, Any]:
 def test_an_evaluation_that_does_not_fit_is_refused(
     policy: str, changed: dict[str, Any], reason: str
 ) -> None:
-    session = policy_server.Session(policy)
+    session = policy_session.Session(policy)
     answer = wire.decode(session.answer(wire.encode(hello(**changed))))
     assert answer["type"] == "refused"
     assert reason in answer["reason"]
@@ -286,7 +293,7 @@ def test_an_evaluation_that_does_not_fit_is_refused(
     ],
 )
 def test_senseless_messages_are_refused_and_the_conversation_goes_on(message: bytes) -> None:
-    session = policy_server.Session("zero")
+    session = policy_session.Session("zero")
     assert wire.decode(session.answer(message))["type"] == "refused"
     assert wire.decode(session.answer(wire.encode(hello())))["type"] == "welcome"
     for senseless in ({"seed": -1}, {"seed": 2**32}, {"seed": True}, {}):
