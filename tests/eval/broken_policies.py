@@ -103,6 +103,12 @@ def hangs(context: PolicyContext) -> Holds:
     return Holds(wait)
 
 
+def lingers(context: PolicyContext) -> Holds:
+    """Says that it is at it, and hangs."""
+    hang = hangs(context)._act
+    return Holds(lambda: [print("at it"), hang()])
+
+
 def dives(context: PolicyContext) -> Holds:
     """Leans over until it hits the ground."""
     policy = still(context)

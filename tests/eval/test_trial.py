@@ -165,6 +165,19 @@ def test_code_that_is_no_policy_is_refused_in_one_line_and_leaves_nothing_behind
     assert list(out.parent.iterdir()) == []
 
 
+def test_a_policy_s_process_ends_with_an_evaluation_that_is_killed(tmp_path: Path) -> None:
+    code = "import sys; from hvs_suite.cli.main import main; main(sys.argv[1:])"
+    words = f"evaluate --policy broken_policies:lingers --task {TASK} --out {tmp_path}/out.json"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *words.split()], stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr is not None
+        assert process.stderr.readline() == "at it\n"
+        process.kill()
+        # The policy's process writes there as well: this ends when both have.
+        assert process.stderr.read() == ""
+
+
 def test_a_package_around_a_policy_runs_only_where_the_policy_plays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
