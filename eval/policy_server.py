@@ -6,161 +6,30 @@ does: connections cannot disturb one another, and a policy that hangs ends with 
 
 import contextlib
 import dataclasses
-import multiprocessing
-import signal
-from collections.abc import Callable, Iterator
-from multiprocessing.connection import Connection
-from typing import Any
+import http
+import ipaddress
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
 
-import numpy as np
-from dm_env import specs
 from websockets.exceptions import ConnectionClosed
+from websockets.frames import CloseCode
+from websockets.http11 import Request, Response
 from websockets.protocol import State
 from websockets.sync.server import Server, ServerConnection, serve
 
-from hvs_suite.errors import HvsError, OptionError, PolicyError, ServerError
-from hvs_suite.eval import protocol, wire
-from hvs_suite.policies.context import PolicyContext
-from hvs_suite.registry import TASKS
-from hvs_suite.rollout import Policy, library_seeds, one_torch_thread
-from hvs_suite.tasks.shared import lock
+from hvs_suite.errors import OptionError
+from hvs_suite.eval import wire
+from hvs_suite.eval.policy_process import PolicyProcess
 
+MAX_CONNECTIONS = 32
+"""Each has a process with a policy of its own."""
+HANDSHAKE_LIMIT_S = 10.0
+"""For the WebSocket's opening, and again for the first message, which starts a process (s)."""
 # How often a server that waits for its policy looks whether anybody still wants the answer.
 _LOOK_PERIOD_S = 0.2
-
-
-class Session:
-    """One connection's conversation: takes messages, returns answers, never raises.
-
-    Args:
-        policy: What `hvs_suite.policies.catalogue.policy_factory` takes.
-    """
-
-    def __init__(self, policy: str) -> None:
-        self._name = policy
-        self._policy: Policy | None = None
-        self._seeds = contextlib.ExitStack()
-
-    def answer(self, content: Any) -> bytes:
-        """Returns the answer (bytes) to a message (bytes)."""
-        try:
-            message = wire.decode(content)
-            match message["type"]:
-                case "hello":
-                    return wire.encode(self._hello(message))
-                case "reset" if self._policy is not None:
-                    return wire.encode(self._reset(self._policy, message))
-                case "observe" if self._policy is not None:
-                    return wire.encode(self._observe(self._policy, message))
-            raise wire.WireError(f"message {message['type']!r} makes no sense here")
-        except (HvsError, wire.WireError) as error:
-            return wire.encode({"type": "refused", "reason": " ".join(str(error).split())})
-
-    def _hello(self, message: wire.Message) -> wire.Message:
-        if message.get("protocol") != wire.PROTOCOL:
-            raise ServerError(
-                f"this server speaks version {wire.PROTOCOL} of the protocol, "
-                f"not {message.get('protocol')!r}"
-            )
-        contender, context = served(self._name, message.get("task"), message)
-        try:
-            self._policy = contender.make(context)
-        except HvsError:
-            raise
-        except Exception as error:  # other people's code raises anything
-            raise PolicyError(f"{self._name} cannot be built: {error}") from error
-        return {
-            "type": "welcome",
-            "protocol": wire.PROTOCOL,
-            "policy": contender.name,
-            "policy_hash": contender.hash,
-            "policy_parameters": contender.parameters,
-            "training_steps": contender.training_steps,
-            "training_hours": contender.training_hours,
-        }
-
-    def _reset(self, policy: Policy, message: wire.Message) -> wire.Message:
-        seed = message.get("seed")
-        if type(seed) is not int or not 0 <= seed < 2**32:
-            raise wire.WireError("a reset has a seed from 0 to 2^32 - 1")
-        self._seeds.close()
-        self._seeds.enter_context(library_seeds(seed))
-        return _guarded(policy.reset, lambda _: {"type": "done"})
-
-    def _observe(self, policy: Policy, message: wire.Message) -> wire.Message:
-        shown = message.get("observation")
-        if not isinstance(shown, dict):
-            raise wire.WireError("observe has an observation, a map")
-        observation = {name: wire.array(value) for name, value in shown.items()}
-        return _guarded(lambda: policy.select_action(observation), _action)
-
-
-def served(name: str, task: Any, message: wire.Message) -> tuple[protocol.Contender, PolicyContext]:
-    """Finds the policy to serve, and what it may know of the task.
-
-    Args:
-        name: Of the policy.
-        task: Named task, as the evaluation calls it.
-        message: The evaluation's ``hello``.
-
-    Raises:
-        PolicyError: There is no such policy, it does not fit the task, or it cannot be served.
-        ServerError: The evaluation means another version of the task.
-        UnknownTaskError: There is no such task here.
-        WireError: The message lacks something.
-    """
-    protocol.check_public(name)
-    if not isinstance(task, str):
-        raise wire.WireError("hello names a task")
-    contender = protocol.find(name, task)
-    if message.get("task_digest") != lock.digest(task):
-        raise ServerError(f"the evaluation means another version of {task} than this server has")
-    try:
-        observations = {
-            key: spec(key, value) for key, value in dict(message["observations"]).items()
-        }
-        action = spec("action", message["action"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise wire.WireError("hello describes observations and action") from error
-    variant = TASKS[task]
-    return contender, PolicyContext(variant, observations, action, variant.control_period_s)
-
-
-def spec(name: str, description: dict[str, Any]) -> specs.BoundedArray:
-    """Returns the `dm_env` spec that a description stands for."""
-    dtype = description["dtype"]
-    if dtype not in wire.DTYPES:
-        raise wire.WireError(f"dtype {dtype!r} is none of {', '.join(wire.DTYPES)}")
-    return specs.BoundedArray(
-        shape=tuple(int(n) for n in description["shape"]),
-        dtype=np.dtype(dtype),
-        minimum=np.array(description["minimum"], dtype),
-        maximum=np.array(description["maximum"], dtype),
-        name=name,
-    )
-
-
-def _guarded(call: Callable[[], Any], report: Callable[[Any], wire.Message]) -> wire.Message:
-    """Reports what a policy returns, or that it raised."""
-    try:
-        with one_torch_thread():
-            answer = call()
-    except Exception as error:  # a policy raises anything
-        return {
-            "type": "error",
-            "reason": f"raised {type(error).__name__}",
-            "detail": f"{type(error).__name__}: {error}",
-        }
-    return report(answer)
-
-
-def _action(answer: Any) -> wire.Message:
-    """The message that carries a policy's answer; whether it is any good is judged elsewhere."""
-    try:
-        return {"type": "action", "action": np.array(answer, dtype=np.float32)}
-    except (TypeError, ValueError, RuntimeError):
-        detail = f"{type(answer).__name__} is no array"
-        return {"type": "error", "reason": "wrong shape", "detail": detail}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,38 +38,77 @@ class _Handler:
 
     Attributes:
         policy: Its name.
+        place: Working folder of the processes.
+        free: Connections that may still come.
     """
 
     policy: str
+    place: str
+    free: threading.BoundedSemaphore
 
     def __call__(self, websocket: ServerConnection) -> None:
         """Carries messages to and fro until either end closes."""
-        context = multiprocessing.get_context("spawn")
-        ours, theirs = context.Pipe()
-        process = context.Process(target=_work, args=(theirs, self.policy), daemon=True)
-        process.start()
-        theirs.close()
+        if not self.free.acquire(blocking=False):
+            websocket.close(CloseCode.TRY_AGAIN_LATER, f"{MAX_CONNECTIONS} others are playing")
+            return
         try:
-            with contextlib.suppress(ConnectionClosed, EOFError, OSError):
-                for message in websocket:
-                    ours.send_bytes(message if isinstance(message, bytes) else message.encode())
-                    while not ours.poll(_LOOK_PERIOD_S):
-                        if websocket.protocol.state is not State.OPEN:
-                            return
-                    websocket.send(ours.recv_bytes())
+            # Whoever is at fault, the connection ends, and the evaluation sees that.
+            with contextlib.suppress(ConnectionClosed, OSError):
+                self._play(websocket)
         finally:
-            ours.close()
-            process.kill()
-            process.join()
+            self.free.release()
+
+    def _play(self, websocket: ServerConnection) -> None:
+        message = websocket.recv(HANDSHAKE_LIMIT_S)
+        with contextlib.closing(PolicyProcess(self.policy, self.place)) as process:
+            while True:
+                process.send(message if isinstance(message, bytes) else message.encode())
+                while (answer := _look(process)) is None:
+                    if websocket.protocol.state is not State.OPEN:
+                        return
+                websocket.send(answer)
+                message = websocket.recv()
 
 
-def _work(connection: Connection, policy: str) -> None:
-    """Life of a connection's process: answers until the server closes the pipe."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    session = Session(policy)
-    with contextlib.suppress(EOFError, OSError):
-        while True:
-            connection.send_bytes(session.answer(connection.recv_bytes()))
+def _look(process: PolicyProcess) -> bytes | None:
+    """The process's answer, if it comes soon."""
+    with contextlib.suppress(TimeoutError):
+        return process.recv(_LOOK_PERIOD_S)
+    return None
+
+
+@dataclasses.dataclass(frozen=True)
+class _Doorkeeper:
+    """Turns away whoever was sent here by somebody else's web page.
+
+    A browser lets any page connect to any address, and says so in ``Origin``; a name that points to
+    this machine only for a while shows in ``Host``. Evaluations send no ``Origin``.
+
+    Attributes:
+        host: Where the server listens.
+    """
+
+    host: str
+
+    def __call__(self, websocket: ServerConnection, request: Request) -> Response | None:
+        """Returns what to answer instead of a connection, if any."""
+        if "Origin" in request.headers:
+            return websocket.respond(http.HTTPStatus.FORBIDDEN, "no web page may connect\n")
+        hosts = request.headers.get_all("Host")
+        if len(hosts) != 1 or not self._is_mine(hosts[0]):
+            return websocket.respond(http.HTTPStatus.FORBIDDEN, "no name of this server\n")
+        return None
+
+    def _is_mine(self, host: str) -> bool:
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+        except ValueError:
+            return False
+        with contextlib.suppress(ValueError):
+            ipaddress.ip_address(name)
+            return True
+        names = {"localhost", self.host, socket.gethostname(), socket.getfqdn()}
+        return name in {each.lower() for each in names}
 
 
 @contextlib.contextmanager
@@ -220,11 +128,15 @@ def listening(policy: str, host: str, port: int) -> Iterator[tuple[Server, str]]
     """
     try:
         server = serve(
-            _Handler(policy),
+            _Handler(policy, str(Path.cwd()), threading.BoundedSemaphore(MAX_CONNECTIONS)),
             host,
             port,
             compression=None,
+            process_request=_Doorkeeper(host),
+            open_timeout=HANDSHAKE_LIMIT_S,
             max_size=wire.MAX_MESSAGE_BYTES,
+            # One message, one answer: whoever sends more waits.
+            max_queue=1,
             close_timeout=1.0,
         )
     except (OSError, OverflowError) as error:

@@ -4,26 +4,26 @@ import contextlib
 import dataclasses
 import datetime
 import hashlib
+import random
 import time
 from collections.abc import Callable, Generator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from hvs_suite import files, registry, rollout
-from hvs_suite.errors import OptionError, PolicyError, ScenarioError
-from hvs_suite.eval import action_log, progress_file, provenance, result_file
-from hvs_suite.eval.trial import PlayTrial, Trial
-from hvs_suite.policies.catalogue import policy_factory
-from hvs_suite.policies.context import Blindfolded
-from hvs_suite.policies.imported import ImportedFactory
+from hvs_suite.errors import OptionError, ScenarioError
+from hvs_suite.eval import (
+    action_log,
+    contender,
+    policy_process,
+    progress_file,
+    provenance,
+    result_file,
+)
+from hvs_suite.eval.contender import Contender
+from hvs_suite.eval.trial import DECISION_LIMIT_S, PlayTrial, Trial, check_decision_limit
 from hvs_suite.tasks.shared import lock
 from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
-
-DECISION_LIMIT_S = 10.0
-"""A hundred control periods: far above any policy that could be used, below a hung one."""
-
-PRIVILEGED = ("expert", "random")
-"""Policies that may look behind the observations: at the true state, or at the scenario's index."""
 
 Progress = Callable[[Trial], None]
 
@@ -49,85 +49,6 @@ class MakeTask:
         return env
 
 
-@dataclasses.dataclass(frozen=True)
-class Contender:
-    """Who is scored, and what the result says of it.
-
-    Attributes:
-        name: As shown in the result.
-        kind: ``builtin``, ``checkpoint``, ``module`` or ``server``.
-        make: Builds it for an environment.
-        hash: As ``policy_hash`` in the result.
-        parameters: As ``policy_parameters``.
-        training_steps: As in the result.
-        training_hours: As in the result.
-    """
-
-    name: str
-    kind: Literal["builtin", "checkpoint", "module", "server"]
-    make: rollout.PolicyFactory
-    hash: str | None = None
-    parameters: int | None = None
-    training_steps: int | None = None
-    training_hours: float | None = None
-
-
-def find(policy: str, task: str) -> Contender:
-    """Finds the policy behind a name.
-
-    Args:
-        policy: As `policy_factory` takes it.
-        task: Named task.
-
-    Raises:
-        UnknownTaskError: There is no such task.
-        PolicyError: There is no such policy, or it does not fit the task.
-    """
-    registry.find(task)
-    make = policy_factory(policy, task)
-    # An absolute path would tell who ran it and where.
-    name = Path(policy).name if Path(policy).is_absolute() else policy
-    if isinstance(make, ImportedFactory):
-        source = make.source()
-        return Contender(
-            name=name,
-            kind="module",
-            make=make,
-            hash=None if source is None else provenance.file_hash(source),
-        )
-    # A policy that comes from a checkpoint, shipped or not, knows its folder.
-    folder: str | None = getattr(make, "folder", None)
-    if folder is None:
-        make = make if policy in PRIVILEGED else Blindfolded(make)
-        return Contender(name=name, kind="builtin", make=make)
-    training = provenance.training(Path(folder))
-    return Contender(
-        name=name,
-        kind="checkpoint",
-        make=Blindfolded(make),
-        hash=provenance.checkpoint_hash(Path(folder)),
-        parameters=provenance.parameters(Path(folder)),
-        training_steps=training.steps,
-        training_hours=training.hours,
-    )
-
-
-def check_public(policy: str) -> None:
-    """Checks that a policy makes do with what a task shows.
-
-    Args:
-        policy: As `policy_factory` takes it.
-
-    Raises:
-        PolicyError: It looks behind the observations.
-    """
-    if policy in PRIVILEGED:
-        raise PolicyError(
-            f"{policy} looks behind the observations, which do not travel; evaluate it without a "
-            "server"
-        )
-
-
 def evaluate(
     policy: str | Contender,
     task: str,
@@ -141,10 +62,12 @@ def evaluate(
 ) -> result_file.Result:
     """Scores a policy on the first scenarios of a split and writes the result.
 
-    Interrupted, the same call goes on where it was, and ends in the same result.
+    Interrupted, the same call goes on where it was, and ends in the same result. A person's own
+    code (``module:factory``) plays in a process of its own, which holds no simulator. Scenarios
+    come in an order drawn for this run: no policy learns by counting which one it plays.
 
     Args:
-        policy: What `policy_factory` takes, or a contender.
+        policy: What `hvs_suite.policies.catalogue.policy_factory` takes, or a contender.
         task: Named task, played as named.
         out: Result file to write (JSON); the action log and, meanwhile, what is already played
             stand beside it. None writes nothing.
@@ -162,8 +85,9 @@ def evaluate(
         UnknownTaskError: There is no such task.
         PolicyError: There is no such policy, or it does not fit the task.
         ScenarioError: The split does not hold that many scenarios.
-        OptionError: `episodes` or `workers` is below 1, or the time limit is not positive.
-        OutputError: The result cannot be written, or the beginning of another one is in its place.
+        OptionError: `episodes` or `workers` is below 1, or the time limit is no time limit.
+        OutputError: The result cannot be written, another process is writing it, or the beginning
+            of another one is in its place.
         RenderError: Nothing here can draw the images.
         ServerError: The policy's server is gone; what is already played is kept.
     """
@@ -171,24 +95,26 @@ def evaluate(
         raise OptionError(f"episodes must be at least 1, not {episodes}")
     if workers < 1:
         raise OptionError(f"workers must be at least 1, not {workers}")
-    if not decision_limit_s > 0:
-        raise OptionError(f"the time limit of a decision must be positive, not {decision_limit_s}")
+    check_decision_limit(decision_limit_s)
     if split == TEST_SPLIT and episodes > TEST_SCENARIOS:
         raise ScenarioError(
             f"split {TEST_SPLIT!r} holds {TEST_SCENARIOS} scenarios, not {episodes}; ask for "
             f"{TEST_SCENARIOS} episodes or fewer"
         )
     variant = registry.find(task)
-    contender = find(policy, task) if isinstance(policy, str) else policy
+    player = contender.find(policy, task) if isinstance(policy, str) else policy
+    make = player.make
+    if player.kind == "module":
+        make = policy_process.ProcessFactory(player.name, str(Path.cwd()), task, decision_limit_s)
     renderer = provenance.gl_renderer()
     identity = {
         "schema_version": result_file.SCHEMA_VERSION,
         "task": task,
         "task_digest": lock.digest(task),
         "split": split,
-        "policy": contender.name,
-        "policy_kind": contender.kind,
-        "policy_hash": contender.hash,
+        "policy": player.name,
+        "policy_kind": player.kind,
+        "policy_hash": player.hash,
         "decision_limit_s": decision_limit_s,
         "suite_version": provenance.suite_version(),
         "packages": provenance.package_versions(),
@@ -200,13 +126,14 @@ def evaluate(
     if out is not None:
         files.check_writable(out)
     with progress_file.ProgressFile(partial, identity) as kept:
+        order = random.Random(kept.salt).sample(range(episodes), episodes)
         wall_s = _play_rest(
             kept,
             rollout.play(
                 MakeTask(task, split),
-                contender.make,
-                [index for index in range(episodes) if index not in kept.trials],
-                PlayTrial(decision_limit_s),
+                make,
+                [index for index in order if index not in kept.trials],
+                PlayTrial(decision_limit_s, kept.salt),
                 workers=workers,
             ),
             progress,
@@ -220,7 +147,7 @@ def evaluate(
             schema_version=result_file.SCHEMA_VERSION,
             summary=result_file.Summary.of(
                 task,
-                contender.name,
+                player.name,
                 split,
                 rows,
                 tolerances=variant.tolerances,
@@ -234,11 +161,11 @@ def evaluate(
                 tolerances=variant.tolerances,
                 time_limit_steps=variant.time_limit_steps,
                 options={},
-                policy_kind=contender.kind,
-                policy_hash=contender.hash,
-                policy_parameters=contender.parameters,
-                training_steps=contender.training_steps,
-                training_hours=contender.training_hours,
+                policy_kind=player.kind,
+                policy_hash=player.hash,
+                policy_parameters=player.parameters,
+                training_steps=player.training_steps,
+                training_hours=player.training_hours,
                 decision_limit_s=decision_limit_s,
                 actions_sha256=hashlib.sha256(log).hexdigest(),
                 packages=provenance.package_versions(),

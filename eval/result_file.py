@@ -59,7 +59,7 @@ class EpisodeRow(_Block):
         height_error_mm: Along the surface normal.
         tilt_error_deg: Between flange axis and inward surface normal.
         failure: Why the policy lost the episode before the goal: ``not finite``, ``wrong shape``,
-            ``too slow``, or ``raised <error>``; None if it did not.
+            ``too slow``, ``process ended`` or ``raised <error>``; None if it did not.
         settled_steps: Control steps played altogether.
         settled_collision: A forbidden contact ended them.
         settled_failure: As ``failure``, after the goal too.

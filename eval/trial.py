@@ -21,12 +21,17 @@ import dm_env
 import numpy as np
 import numpy.typing as npt
 
+from hvs_suite.errors import OptionError, describe
 from hvs_suite.eval.result_file import ERRORS, EpisodeRow
 from hvs_suite.rollout import Action, Observation, Policy, library_seeds
 
 NOT_FINITE = "not finite"
 WRONG_SHAPE = "wrong shape"
 TOO_SLOW = "too slow"
+
+DECISION_LIMIT_S = 10.0
+"""A hundred control periods: far above any policy that could be used, below a hung one."""
+LONGEST_DECISION_LIMIT_S = 3600.0
 # A policy in another process keeps the time itself; this much later the alarm goes off anyway (s).
 _GRACE_S = 5.0
 NEAR_MM = 1e-3
@@ -80,18 +85,22 @@ class EpisodeLostError(Exception):
 
 
 class Connected(abc.ABC):
-    """A policy at the other end of a connection, which is made before the clock starts.
+    """A policy in another process, to which a connection is made before the clock starts.
 
     `Policy.select_action` and `Policy.reset` of such a policy keep the time limit of a decision by
     themselves; they and nobody else's raise `EpisodeLostError`.
     """
 
     @abc.abstractmethod
-    def connect(self) -> None:
+    def connect(self, seed: int) -> None:
         """Makes the connection if there is none.
+
+        Args:
+            seed: What the policy is told at the next reset; it may draw from it.
 
         Raises:
             ServerError: There is nobody at the other end. The run stops, and resumes.
+            PolicyError: The policy cannot be built there.
         """
 
 
@@ -125,15 +134,18 @@ class PlayTrial:
 
     Attributes:
         decision_limit_s: Time after which a decision loses the episode (s).
+        salt: Of this run, for `episode_seed`.
     """
 
     decision_limit_s: float
+    salt: str
 
     def __call__(self, env: Stage, policy: Policy, scenario: int) -> Trial:
         """Plays one scenario; a policy that breaks down loses it, and nothing else."""
+        seed = episode_seed(self.salt, scenario)
         if isinstance(policy, Connected):
-            policy.connect()
-        return _play_policy(env, policy, scenario, self.decision_limit_s)
+            policy.connect(seed)
+        return _play_policy(env, policy, scenario, seed, self.decision_limit_s)
 
 
 def play_trial(
@@ -197,7 +209,7 @@ def play_trial(
     return row, np.array(actions, np.float32).reshape(-1, *spec.shape), nearness
 
 
-def _play_policy(env: Stage, policy: Policy, scenario: int, limit_s: float) -> Trial:
+def _play_policy(env: Stage, policy: Policy, scenario: int, seed: int, limit_s: float) -> Trial:
     """A live policy's trial: times, checks and guards each of its decisions."""
     shape = env.action_spec().shape
     is_connected = isinstance(policy, Connected)
@@ -221,7 +233,7 @@ def _play_policy(env: Stage, policy: Policy, scenario: int, limit_s: float) -> T
             if is_connected and isinstance(error, EpisodeLostError):
                 detail = error.detail
                 raise
-            detail = f"{type(error).__name__}: {error}"
+            detail = describe(error)
             raise EpisodeLostError(f"raised {type(error).__name__}", detail) from error
         times.append(time.perf_counter() - started)
         if times[-1] > limit_s:
@@ -241,7 +253,7 @@ def _play_policy(env: Stage, policy: Policy, scenario: int, limit_s: float) -> T
     begun = time.perf_counter()
 
     def start() -> None:
-        seeds.enter_context(library_seeds(episode_seed(env.info["split"], scenario)))
+        seeds.enter_context(library_seeds(seed))
         guarded(policy.reset)
 
     with contextlib.ExitStack() as seeds, _alarm_clock() as set_alarm:
@@ -274,10 +286,32 @@ def _checked(answer: Any, shape: Sequence[int]) -> Action:
     return action
 
 
-def episode_seed(split: str, scenario: int) -> int:
-    """Returns the seed that a policy may draw from in a scenario, in [0, 2^32)."""
-    digest = hashlib.sha256(f"episode {split} {scenario}".encode()).digest()
+def episode_seed(salt: str, scenario: int) -> int:
+    """Returns the seed that a policy may draw from in a scenario, in [0, 2^32).
+
+    Args:
+        salt: A secret of the run. Without it, a table made beforehand would tell a policy from its
+            seed which scenario it plays.
+        scenario: Index in the split.
+    """
+    digest = hashlib.sha256(f"episode {salt} {scenario}".encode()).digest()
     return int.from_bytes(digest[:4], "little")
+
+
+def check_decision_limit(limit_s: float) -> None:
+    """Checks the time limit of a decision.
+
+    Args:
+        limit_s: As the user gave it (s).
+
+    Raises:
+        OptionError: It is not above 0 and at most `LONGEST_DECISION_LIMIT_S`.
+    """
+    if not 0.0 < limit_s <= LONGEST_DECISION_LIMIT_S:
+        raise OptionError(
+            f"the time limit of a decision is {limit_s:g} s; use more than 0 and at most "
+            f"{LONGEST_DECISION_LIMIT_S:g} s"
+        )
 
 
 class _DeadlineError(BaseException):

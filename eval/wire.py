@@ -12,8 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 PROTOCOL: Final = 1
-MAX_MESSAGE_BYTES: Final = 64 * 2**20
-"""Two pictures of 2048 x 2048 x 3 fit."""
+MAX_MESSAGE_BYTES: Final = 8 * 2**20
+"""Two pictures of 1024 x 1024 x 3 fit; unpacked, a malicious message may take fifty times that."""
+MAX_ANSWER_BYTES: Final = 64 * 2**10
+"""An action and a line of text: answers need no more."""
 
 DTYPES = {"uint8": "|u1", "float32": "<f4", "float64": "<f8"}
 _MAX_DIMENSIONS = 8

@@ -47,3 +47,16 @@ class ResultError(HvsError, ValueError):
 
 class ServerError(HvsError, ConnectionError):
     """A policy server that cannot be reached, breaks off, or speaks another protocol."""
+
+
+def describe(error: BaseException) -> str:
+    """Returns the name and the text of an error, even of one whose own text raises.
+
+    Args:
+        error: Of other people's code, say.
+    """
+    try:
+        text = str(error)
+    except Exception:
+        text = ""
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__

@@ -27,9 +27,12 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = Path(path)
     check_writable(target)
-    descriptor, name = tempfile.mkstemp(
-        dir=target.parent, prefix=f".{target.stem}-", suffix=target.suffix
-    )
+    try:
+        descriptor, name = tempfile.mkstemp(
+            dir=target.parent, prefix=f".{target.stem}-", suffix=target.suffix
+        )
+    except OSError as error:
+        raise OutputError(f"cannot write {target}: {error.strerror}") from error
     os.close(descriptor)
     temporary = Path(name)
     try:
@@ -77,15 +80,28 @@ def only_writer(folder: Path) -> Iterator[None]:
     """
     descriptor = os.open(folder, os.O_RDONLY)
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise OutputError(
-                f"another process is writing into {folder}; wait for it, or name another folder"
-            ) from None
+        lock(descriptor, folder)
         yield
     finally:
         os.close(descriptor)
+
+
+def lock(descriptor: int, place: Path) -> None:
+    """Take the writer's lock of an open file or folder; it ends when the descriptor is closed.
+
+    Args:
+        descriptor: Of the file or folder.
+        place: Its path, for the message.
+
+    Raises:
+        OutputError: Another process has the lock.
+    """
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise OutputError(
+            f"another process is writing into {place}; wait for it, or name another place"
+        ) from None
 
 
 def _umask() -> int:

@@ -22,7 +22,7 @@ def policy_factory(spec: str, task: str) -> PolicyFactory:
         spec: ``expert``, ``servo``, ``zero``, ``random``, ``pretrained``, ``finetuned`` (the
             weights shipped for the task), a checkpoint folder, a checkpoint's Hub id
             (``owner/name``), or ``module:factory`` for code of one's own, which is imported and run
-            (see `hvs_suite.policies.imported`).
+            once the policy is built (see `hvs_suite.policies.imported`).
         task: Named task.
 
     Returns:

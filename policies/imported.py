@@ -1,19 +1,20 @@
 """Plays a person's own code: ``module:factory``, anything with ``reset`` and ``select_action``.
 
 Importing the module runs its code with all the rights of whoever evaluates it. Nothing in the suite
-does so unless that name was typed on the command line or passed to `policy_factory`.
+does so unless that name was typed on the command line or passed to `policy_factory`; a score is
+played in a process apart (see `hvs_suite.eval.policy_process`).
 """
 
 import dataclasses
 import importlib
-import importlib.util
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from typing import Any
 
-from hvs_suite.errors import PolicyError
+from hvs_suite.errors import PolicyError, describe
 from hvs_suite.policies.context import PolicyContext
 from hvs_suite.rollout import Policy
 
@@ -22,71 +23,84 @@ NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 
 @dataclasses.dataclass(frozen=True)
 class ImportedFactory:
-    """Builds policies with ``factory(context)``; travels to workers as two names and a folder.
+    """Builds policies with ``factory(context)``; travels to other processes as three texts.
 
     Attributes:
         module: Importable name.
         factory: Callable in it; takes a `PolicyContext`.
-        folder: Searched before the rest of the path: where the command was given.
+        place: Folder that is searched before the rest of the path: where the command was given.
     """
 
     module: str
     factory: str
-    folder: str
+    place: str
 
     def __call__(self, env: Any) -> Policy:
-        """Builds the policy for an environment.
+        """Imports the module, which runs its code, and builds the policy for an environment.
 
         Raises:
             PolicyError: The module cannot be imported, or what it makes is no policy.
         """
-        policy: Any = self.callable()(PolicyContext.of(env))
+        name = f"{self.module}:{self.factory}"
+        make = self._callable()
+        try:
+            policy: Any = make(PolicyContext.of(env))
+        except PolicyError:
+            raise
+        except (Exception, SystemExit) as error:  # other people's code raises anything
+            raise PolicyError(
+                f"{name} cannot be built ({describe(error)}); a factory takes one PolicyContext"
+            ) from error
         for method in ("reset", "select_action"):
             if not callable(getattr(policy, method, None)):
                 raise PolicyError(
-                    f"{self.module}:{self.factory} made {type(policy).__name__}, which has no "
+                    f"{name} made {type(policy).__name__}, which has no "
                     f"{method}(); a policy has reset() and select_action(observation)"
                 )
         return policy
 
-    def callable(self) -> Callable[[PolicyContext], Any]:
-        """Imports the module, which runs its code, and returns the factory.
+    def source(self) -> Path | None:
+        """Returns the module's own file, without running anything; None if it has none.
 
         Raises:
-            PolicyError: There is no such module or factory, or importing it fails.
+            PolicyError: There is no such module.
         """
-        if self.folder not in sys.path:
-            sys.path.insert(0, self.folder)
+        # `importlib.util.find_spec` would run the packages around the module.
+        package, _, rest = self.module.partition(".")
+        spec = PathFinder.find_spec(package, [self.place]) or _find(package, None)
+        for part in rest.split(".") if rest else ():
+            if spec is None or spec.submodule_search_locations is None:
+                spec = None
+                break
+            spec = _find(f"{spec.name}.{part}", spec.submodule_search_locations)
+        if spec is None:
+            raise PolicyError(f"cannot import {self.module}: there is no module of this name")
+        return Path(spec.origin) if spec.has_location and spec.origin else None
+
+    def _callable(self) -> Callable[[PolicyContext], Any]:
+        if self.place not in sys.path:
+            sys.path.insert(0, self.place)
         try:
             module = importlib.import_module(self.module)
-        except Exception as error:  # somebody else's module raises anything
-            raise PolicyError(f"cannot import {self.module}: {error}") from error
+        except (Exception, SystemExit) as error:  # somebody else's module raises anything
+            raise PolicyError(f"cannot import {self.module}: {describe(error)}") from error
         found = getattr(module, self.factory, None)
         if not callable(found):
             raise PolicyError(f"module {self.module} has no callable {self.factory}")
         return found
 
-    def source(self) -> Path | None:
-        """Returns the module's own file, without running it; None if it has none."""
-        if self.folder not in sys.path:
-            sys.path.insert(0, self.folder)
-        try:
-            spec = importlib.util.find_spec(self.module)
-        except (ImportError, ValueError):
-            return None
-        return Path(spec.origin) if spec is not None and spec.has_location and spec.origin else None
+
+def _find(name: str, path: Sequence[str] | None) -> ModuleSpec | None:
+    """Asks each of Python's finders where a module lies, as an import does."""
+    found = (finder.find_spec(name, path) for finder in sys.meta_path)
+    return next((spec for spec in found if spec is not None), None)
 
 
 def imported_factory(spec: str) -> ImportedFactory:
-    """Returns the factory behind ``module:factory``, imported once here, before any worker starts.
+    """Returns the factory behind ``module:factory``, of which nothing has run yet.
 
     Args:
         spec: As typed by the user.
-
-    Raises:
-        PolicyError: There is no such module or factory, or importing it fails.
     """
     module, _, name = spec.partition(":")
-    factory = ImportedFactory(module, name, str(Path.cwd()))
-    factory.callable()
-    return factory
+    return ImportedFactory(module, name, str(Path.cwd()))

@@ -9,7 +9,7 @@ from hvs_suite.cli import console
 from hvs_suite.errors import OptionError
 
 if TYPE_CHECKING:
-    from hvs_suite.eval.protocol import Contender
+    from hvs_suite.eval.contender import Contender
     from hvs_suite.eval.result_file import Result
     from hvs_suite.eval.trial import Trial
 
@@ -50,6 +50,7 @@ class Evaluate:
     def run(self) -> int:
         """Evaluate, write the results, print their summaries."""
         from hvs_suite import files, registry
+        from hvs_suite.eval import trial
 
         if not self.task:
             raise OptionError("name a --task; 'hvs tasks' lists them")
@@ -61,6 +62,7 @@ class Evaluate:
         for task, path in zip(self.task, paths, strict=True):
             registry.find(task)
             files.check_writable(path)
+        trial.check_decision_limit(self.decision_limit)
         # Every policy is found before the first is played.
         contenders = [self._find(task) for task in self.task]
         for task, path, contender in zip(self.task, paths, contenders, strict=True):
@@ -69,10 +71,10 @@ class Evaluate:
         return 0
 
     def _find(self, task: str) -> "Contender":
-        from hvs_suite.eval import protocol
+        from hvs_suite.eval import contender
 
         if self.server is None:
-            return protocol.find(self.policy, task)
+            return contender.find(self.policy, task)
         from hvs_suite.eval import remote_policy
 
         return remote_policy.find(self.server, self.policy, task, self.decision_limit)

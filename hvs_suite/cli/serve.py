@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import os
 import signal
 from types import FrameType
 
@@ -31,11 +30,8 @@ class Serve:
         if not 0 <= self.port < 2**16:
             raise OptionError(f"--port is {self.port}; use 0 to 65535")
         from hvs_suite.eval import policy_server
-        from hvs_suite.rollout import WORKER_ENVIRONMENT
 
         tasks = _tasks(self.policy)
-        for name, value in WORKER_ENVIRONMENT.items():
-            os.environ.setdefault(name, value)
         signal.signal(signal.SIGTERM, _interrupt)
         with (
             contextlib.suppress(KeyboardInterrupt),
@@ -53,15 +49,15 @@ def _tasks(policy: str) -> list[str]:
     Raises:
         PolicyError: There are none.
     """
-    from hvs_suite.eval import protocol
+    from hvs_suite.eval import contender
     from hvs_suite.registry import TASKS
 
-    protocol.check_public(policy)
+    contender.check_public(policy)
     found: list[str] = []
     refusal: PolicyError | None = None
     for task in TASKS:
         try:
-            protocol.find(policy, task)
+            contender.find(policy, task)
             found.append(task)
         except PolicyError as error:
             refusal = refusal or error

@@ -1,7 +1,10 @@
 """Policies that misbehave, for the tests; named on the command line as broken_policies:<name>."""
 
+import gc
+import os
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -43,6 +46,51 @@ def raises(context: PolicyContext) -> Holds:
     return Holds(lambda: [][1])
 
 
+class MuteError(Exception):
+    """An error which cannot even say what is wrong."""
+
+    def __str__(self) -> str:
+        raise RuntimeError("no words")
+
+
+def mute(context: PolicyContext) -> Holds:
+    def fail() -> None:
+        raise MuteError
+
+    return Holds(fail)
+
+
+class Trap:
+    """An array of its own making."""
+
+    def __array__(self, *args: Any, **options: Any) -> Any:
+        raise MuteError
+
+
+def trap(context: PolicyContext) -> Holds:
+    return Holds(Trap)
+
+
+def leaves(context: PolicyContext) -> Holds:
+    return Holds(lambda: sys.exit(0))
+
+
+def interrupts(context: PolicyContext) -> Holds:
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    return Holds(interrupt)
+
+
+def ends(context: PolicyContext) -> Holds:
+    return Holds(lambda: os._exit(0))
+
+
+def shouts(context: PolicyContext) -> Holds:
+    """Prints, which is no output of the evaluation's."""
+    return Holds(lambda: [print("here I am"), [0.0] * 7][1])
+
+
 def hangs(context: PolicyContext) -> Holds:
     # As stubborn as they come: it catches whatever it can.
     def wait() -> None:
@@ -53,6 +101,12 @@ def hangs(context: PolicyContext) -> Holds:
                 continue
 
     return Holds(wait)
+
+
+def lingers(context: PolicyContext) -> Holds:
+    """Says that it is at it, and hangs."""
+    hang = hangs(context)._act
+    return Holds(lambda: [print("at it"), hang()])
 
 
 def dives(context: PolicyContext) -> Holds:
@@ -83,5 +137,48 @@ def curious(context: PolicyContext) -> Holds:
     return policy
 
 
+def _truth() -> Iterator[str]:
+    """Whatever tells more than the observations: all that Python shows to anybody who looks."""
+    simulator = (
+        "mujoco",
+        "dm_control",
+        "hvs_suite.tasks.shared.environment",
+        "hvs_suite.tasks.shared.scenario",
+    )
+    yield from (name for name in sys.modules if name.startswith(simulator))
+    for thing in gc.get_objects():
+        kind = type(thing)
+        if str(getattr(kind, "__module__", "")).startswith(simulator):
+            yield f"a {kind.__module__}.{kind.__qualname__}"
+        if kind is dict and type(thing.get("scenario")) is int:
+            yield "a scenario's index"
+    frame = sys._getframe()
+    while frame is not None:
+        yield from (f"{name} in a frame" for name in ("env", "scenario") if name in frame.f_locals)
+        frame = frame.f_back
+
+
+def spies(context: PolicyContext) -> Holds:
+    """Fails if it finds anything of the simulator in its process."""
+
+    def look() -> Any:
+        assert not (found := sorted(set(_truth()))), found
+        return np.zeros(7)
+
+    return Holds(look)
+
+
 def nothing(context: PolicyContext) -> object:
     return object()
+
+
+def no_arguments() -> Holds:
+    return Holds(lambda: None)
+
+
+def wordless(context: PolicyContext) -> Holds:
+    raise MuteError
+
+
+def exits(context: PolicyContext) -> Holds:
+    sys.exit(0)

@@ -4,6 +4,7 @@ import contextlib
 import itertools
 import json
 import pickle
+import socket
 import subprocess
 import sys
 import threading
@@ -11,16 +12,27 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import msgpack
 import numpy as np
 import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
 from websockets.sync.server import serve
 
 import hvs_suite
 from hvs_suite.cli import main
 from hvs_suite.errors import OptionError, PolicyError, ServerError
-from hvs_suite.eval import policy_server, protocol, remote_policy, result_file, wire
+from hvs_suite.eval import (
+    policy_server,
+    policy_session,
+    progress_file,
+    protocol,
+    remote_policy,
+    result_file,
+    wire,
+)
 from hvs_suite.rollout import run_episode
 
 TASK = "align-thesis"
@@ -49,21 +61,38 @@ def serving(talk: Callable[[Any], None], port: int = 0) -> Iterator[str]:
             thread.join()
 
 
+@contextlib.contextmanager
+def reference(policy: str) -> Iterator[str]:
+    """The reference server, a process for each connection."""
+    with policy_server.listening(policy, "127.0.0.1", 0) as (server, url):
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield url
+        finally:
+            server.shutdown()
+            thread.join()
+
+
 def conversation(policy: str) -> Callable[[Any], None]:
     """The reference server's conversation, without the process around it."""
 
     def talk(websocket: Any) -> None:
-        session = policy_server.Session(policy)
+        session = policy_session.Session(policy)
         for message in websocket:
             websocket.send(session.answer(message))
 
     return talk
 
 
+def welcome(**said: Any) -> dict[str, Any]:
+    return {"type": "welcome", "protocol": 1, **said}
+
+
 def answers(**changed: Any) -> Callable[[Any], None]:
     """A conversation of fixed answers; a callable answers by itself, None breaks off."""
     fixed = {
-        "hello": {"type": "welcome", "protocol": 1},
+        "hello": welcome(),
         "reset": {"type": "done"},
         "observe": {"type": "action", "action": [0.0] * 7},
     }
@@ -101,16 +130,13 @@ def test_a_served_policy_gets_the_rows_that_it_gets_in_process() -> None:
     assert served.summary.policy == "someone"
 
 
-def test_two_workers_do_not_disturb_each_others_random_numbers() -> None:
+def test_two_workers_do_not_disturb_each_others_random_numbers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(progress_file.secrets, "token_hex", lambda n: "5a" * n)
     own = protocol.evaluate("broken_policies:draws", TASK, episodes=4)
-    with policy_server.listening("broken_policies:draws", "127.0.0.1", 0) as (server, url):
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            served = evaluate(url, 4, workers=2)
-        finally:
-            server.shutdown()
-            thread.join()
+    with reference("broken_policies:draws") as url:
+        served = evaluate(url, 4, workers=2)
     assert served.episodes == own.episodes
     assert served.metadata.policy_hash == own.metadata.policy_hash
 
@@ -120,7 +146,7 @@ def test_a_served_policy_knows_of_the_task_what_it_knows_in_process() -> None:
         assert evaluate(url, 1).summary.failures == {}
     with hvs_suite.load(TASK) as env:
         message = msgpack.unpackb(wire.encode(remote_policy.hello(TASK, env)))
-        _, context = policy_server.served("servo", TASK, message)
+        _, context = policy_session.served("servo", TASK, message)
         assert context.observations == dict(env.observation_spec())
         assert context.action == env.action_spec()
         assert context.variant == env.variant
@@ -158,6 +184,10 @@ def test_a_served_policy_loses_episodes_for_the_reasons_that_it_does_in_process(
         ({"observe": {"type": "done"}}, "bad answer"),
         ({"observe": b"\xc1"}, "bad answer"),
         ({"observe": pickle.dumps([0.0] * 7)}, "bad answer"),
+        (
+            {"observe": {"type": "action", "action": [2**63, *[0.0] * 6], "x": "." * 2**20}},
+            "disconnected",
+        ),
         ({"observe": {"type": "error", "reason": "raised OSError"}}, "raised OSError"),
         ({"observe": {"type": "error", "reason": "<b>its fault</b>"}}, "bad answer"),
     ],
@@ -178,8 +208,8 @@ def test_one_broken_connection_costs_one_episode() -> None:
 
     with serving(answers(observe=once)) as url:
         result = evaluate(url, 3)
-    assert [row.failure for row in result.episodes] == ["disconnected", None, None]
-    assert result.episodes[0].steps == 3
+    assert result.summary.failures == {"disconnected": 1}
+    assert sorted(row.steps for row in result.episodes)[0] == 3
 
 
 def test_a_server_that_is_gone_stops_the_run_which_resumes_when_it_is_back(
@@ -210,8 +240,7 @@ def test_a_server_that_is_gone_stops_the_run_which_resumes_when_it_is_back(
     assert not out.exists()
     with serving(answers()) as url:
         assert main.run(command(url)) == 0
-    failures = [row.failure for row in result_file.load(out).episodes]
-    assert failures == [None, "disconnected", None, None]
+    assert result_file.load(out).summary.failures == {"disconnected": 1}
 
 
 @pytest.mark.parametrize(
@@ -222,6 +251,13 @@ def test_a_server_that_is_gone_stops_the_run_which_resumes_when_it_is_back(
         ({"type": "action"}, "refuses"),
         (b"hello yourself", "does not greet back"),
         (None, "does not greet back"),
+        (welcome(policy_parameters=-1), "policy_parameters"),
+        (welcome(policy_parameters=1.5), "policy_parameters"),
+        (welcome(training_steps="many"), "training_steps"),
+        (welcome(training_hours=float("nan")), "training_hours"),
+        (welcome(training_hours=float("inf")), "training_hours"),
+        (welcome(policy_hash="\x1b[2J"), "policy_hash"),
+        (welcome(policy="x" * 101), "policy"),
     ],
 )
 def test_a_server_that_does_not_welcome_is_refused_in_one_line_with_2(
@@ -268,7 +304,7 @@ def hello(**changed: Any) -> dict[str, Any]:
 def test_an_evaluation_that_does_not_fit_is_refused(
     policy: str, changed: dict[str, Any], reason: str
 ) -> None:
-    session = policy_server.Session(policy)
+    session = policy_session.Session(policy)
     answer = wire.decode(session.answer(wire.encode(hello(**changed))))
     assert answer["type"] == "refused"
     assert reason in answer["reason"]
@@ -286,7 +322,7 @@ def test_an_evaluation_that_does_not_fit_is_refused(
     ],
 )
 def test_senseless_messages_are_refused_and_the_conversation_goes_on(message: bytes) -> None:
-    session = policy_server.Session("zero")
+    session = policy_session.Session("zero")
     assert wire.decode(session.answer(message))["type"] == "refused"
     assert wire.decode(session.answer(wire.encode(hello())))["type"] == "welcome"
     for senseless in ({"seed": -1}, {"seed": 2**32}, {"seed": True}, {}):
@@ -294,6 +330,78 @@ def test_senseless_messages_are_refused_and_the_conversation_goes_on(message: by
         assert wire.decode(answer)["type"] == "refused"
     answer = session.answer(wire.encode({"type": "observe", "observation": {"eih": [1]}}))
     assert wire.decode(answer)["type"] == "refused"
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({}, None),
+        ({"Host": "localhost:8765"}, None),
+        ({"Host": "[::1]:8765"}, None),
+        ({"Origin": "http://127.0.0.1:8765"}, 403),
+        ({"Origin": "null"}, 403),
+        ({"Host": "rebound.example:8765"}, 403),
+        ({"Host": "127.0.0.1.example"}, 403),
+        ({"Host": "[::1"}, 403),
+    ],
+)
+def test_web_pages_are_turned_away(headers: dict[str, str], status: int | None) -> None:
+    with reference("zero") as url:
+        address = urlsplit(url)
+        asked = {
+            "Host": address.netloc,
+            "Upgrade": "websocket",
+            "Connection": "Upgrade",
+            "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==",
+            "Sec-WebSocket-Version": "13",
+        } | headers
+        lines = [f"{name}: {value}" for name, value in asked.items()]
+        assert address.hostname is not None
+        with socket.create_connection((address.hostname, address.port or 0), 10.0) as connection:
+            connection.sendall("\r\n".join(["GET / HTTP/1.1", *lines, "", ""]).encode())
+            answered = connection.recv(100).split()
+        assert int(answered[1]) == (status or 101)
+
+
+def test_more_connections_than_a_server_takes_are_refused_until_one_ends(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(policy_server, "MAX_CONNECTIONS", 1)
+    with hvs_suite.load(TASK) as env, reference("zero") as url:
+        make = remote_policy.RemoteFactory(url, TASK, 10.0)
+        first = make(env)
+        with pytest.raises(ServerError, match="1 others are playing"):
+            make(env)
+        first.reset()
+        del first
+        deadline = time.monotonic() + 10.0
+        while True:
+            try:
+                make(env).reset()
+                break
+            except ServerError:
+                assert time.monotonic() < deadline
+
+
+def test_whoever_connects_and_says_nothing_is_hung_up_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(policy_server, "HANDSHAKE_LIMIT_S", 0.1)
+    with reference("zero") as url:
+        with connect(url) as silent, pytest.raises(ConnectionClosed):
+            silent.recv(10.0)
+        address = urlsplit(url)
+        assert address.hostname is not None
+        with socket.create_connection((address.hostname, address.port or 0), 10.0) as connection:
+            assert connection.recv(1) == b""
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"), [("ends", "disconnected"), ("leaves", "raised SystemExit")]
+)
+def test_a_served_policy_that_leaves_loses_its_episode_alone(name: str, reason: str) -> None:
+    with reference(f"broken_policies:{name}") as url:
+        result = evaluate(url)
+    assert result.summary.failures == {reason: 2}
+    assert [row.steps for row in result.episodes] == [1, 1]
 
 
 def test_the_commands_serve_and_evaluate(

@@ -4,6 +4,7 @@ import json
 import multiprocessing
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,8 +17,8 @@ import pytest
 
 import hvs_suite
 from hvs_suite.cli import main
-from hvs_suite.errors import OutputError, PolicyError
-from hvs_suite.eval import action_log, protocol, result_file
+from hvs_suite.errors import OutputError
+from hvs_suite.eval import action_log, protocol, provenance, result_file
 from hvs_suite.policies.catalogue import policy_factory
 from hvs_suite.registry import TASKS
 from hvs_suite.rollout import run_episode
@@ -37,6 +38,11 @@ def _own_code(monkeypatch: pytest.MonkeyPatch) -> None:
         ("shape", "wrong shape"),
         ("text", "wrong shape"),
         ("raises", "raised IndexError"),
+        ("mute", "raised MuteError"),
+        ("trap", "wrong shape"),
+        ("leaves", "raised SystemExit"),
+        ("interrupts", "raised KeyboardInterrupt"),
+        ("ends", "process ended"),
         ("hangs", "too slow"),
     ],
 )
@@ -57,14 +63,59 @@ def test_the_deadline_leaves_no_timer_behind() -> None:
     assert signal.getsignal(signal.SIGALRM) is before
 
 
-def test_a_policy_that_draws_from_global_generators_scores_the_same_in_any_order() -> None:
-    one, two = (
-        protocol.evaluate("broken_policies:draws", TASK, episodes=3, workers=workers)
-        for workers in (1, 2)
+def interrupted(path: Path, policy: str, episodes: int) -> Path:
+    """Evaluates one episode; returns what is left of the evaluation."""
+
+    def stop(trial: Any) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        protocol.evaluate(policy, TASK, path, episodes=episodes, progress=stop)
+    return path.with_name(f"{path.name}.partial")
+
+
+def test_seeds_are_a_run_s_own_and_the_same_for_any_workers_and_after_an_interruption(
+    tmp_path: Path,
+) -> None:
+    one, two = tmp_path / "one.json", tmp_path / "two.json"
+    partial = interrupted(one, "broken_policies:draws", 3)
+    shutil.copy(partial, tmp_path / "two.json.partial")
+    first, second, another = (
+        protocol.evaluate("broken_policies:draws", TASK, out, episodes=3, workers=workers)
+        for out, workers in ((one, 1), (two, 2), (tmp_path / "another.json", 1))
     )
-    assert one.episodes == two.episodes
-    assert one.metadata.policy_kind == "module"
-    assert one.metadata.policy_hash is not None
+    assert first.episodes == second.episodes
+    ends = [{row.tilt_error_deg for row in result.episodes} for result in (first, another)]
+    assert not ends[0] & ends[1]
+    assert first.metadata.policy_kind == "module"
+    assert first.metadata.policy_hash is not None
+
+
+def test_no_policy_learns_its_scenario_by_counting() -> None:
+    orders: list[list[int]] = []
+    for _ in range(2):
+        order: list[int] = []
+        protocol.evaluate(
+            "zero", TASK, episodes=20, progress=lambda trial, o=order: o.append(trial.row.scenario)
+        )
+        orders.append(order)
+    assert orders[0] != orders[1]
+    assert sorted(orders[0]) == sorted(orders[1]) == list(range(20))
+
+
+def test_a_person_s_code_plays_where_nothing_of_the_simulator_is() -> None:
+    result = protocol.evaluate("broken_policies:spies", TASK, episodes=1)
+    assert result.summary.failures == {}
+
+
+def test_what_a_policy_prints_is_no_output_of_the_evaluation(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    words = f"evaluate --policy broken_policies:shouts --task {TASK} --episodes 1"
+    assert main.run([*words.split(), "--out", str(tmp_path / "out.json")]) == 0
+    out, err = capfd.readouterr()
+    assert "here I am" in err
+    assert "here I am" not in out
 
 
 def test_evaluating_leaves_the_caller_s_global_generators_alone() -> None:
@@ -86,11 +137,59 @@ def test_a_policy_sees_what_the_preset_shows_and_nothing_else() -> None:
         ("no_such_module:make", "cannot import no_such_module"),
         ("broken_policies:nobody", "no callable nobody"),
         ("broken_policies:nothing", "has no reset"),
+        ("broken_policies:no_arguments", "takes one PolicyContext"),
+        ("broken_policies:wordless", "MuteError"),
+        ("broken_policies:exits", "SystemExit"),
+        ("leaves_at_once:make", "SystemExit"),
+        ("interrupts_at_once:make", "KeyboardInterrupt"),
+        ("ends_at_once:make", "exit code 3"),
     ],
 )
-def test_code_that_is_no_policy_is_refused(spec: str, reason: str) -> None:
-    with pytest.raises(PolicyError, match=reason):
-        protocol.evaluate(spec, TASK, episodes=1)
+def test_code_that_is_no_policy_is_refused_in_one_line_and_leaves_nothing_behind(
+    spec: str,
+    reason: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    code = tmp_path / "code"
+    shutil.copytree(Path(__file__).parent, code, ignore=shutil.ignore_patterns("test_*", "__*"))
+    (code / "leaves_at_once.py").write_text("raise SystemExit(0)")
+    (code / "interrupts_at_once.py").write_text("raise KeyboardInterrupt")
+    (code / "ends_at_once.py").write_text("import os; os._exit(3)")
+    monkeypatch.chdir(code)
+    out = tmp_path / "results" / "out.json"
+    assert main.run(["evaluate", "--policy", spec, "--task", TASK, "--out", str(out)]) == 2
+    (complaint,) = capsys.readouterr().err.splitlines()
+    assert reason in complaint
+    assert list(out.parent.iterdir()) == []
+
+
+def test_a_policy_s_process_ends_with_an_evaluation_that_is_killed(tmp_path: Path) -> None:
+    code = "import sys; from hvs_suite.cli.main import main; main(sys.argv[1:])"
+    words = f"evaluate --policy broken_policies:lingers --task {TASK} --out {tmp_path}/out.json"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *words.split()], stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr is not None
+        assert process.stderr.readline() == "at it\n"
+        process.kill()
+        # The policy's process writes there as well: this ends when both have.
+        assert process.stderr.read() == ""
+
+
+def test_a_package_around_a_policy_runs_only_where_the_policy_plays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "pack").mkdir()
+    (tmp_path / "pack" / "__init__.py").write_text("import os; ran_in = os.getpid()")
+    source = Path(__file__).with_name("broken_policies.py").read_text()
+    (tmp_path / "pack" / "policy.py").write_text(source)
+    monkeypatch.chdir(tmp_path)
+    result = protocol.evaluate("pack.policy:still", TASK, episodes=1)
+    assert result.summary.failures == {}
+    assert result.metadata.policy_hash == provenance.file_hash(tmp_path / "pack" / "policy.py")
+    assert not [name for name in sys.modules if name.partition(".")[0] == "pack"]
 
 
 def test_the_score_is_the_episode_that_ends_at_the_goal() -> None:
@@ -174,18 +273,62 @@ def test_the_beginning_of_another_evaluation_is_not_mixed_in(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "out.json"
-
-    def stop(trial: Any) -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        protocol.evaluate("random", TASK, path, episodes=2, progress=stop)
+    partial = interrupted(path, "random", 2)
     with pytest.raises(OutputError, match=r"another evaluation \(policy differs\)"):
         protocol.evaluate("zero", TASK, path, episodes=2)
-    partial = tmp_path / "out.json.partial"
+    # Killed before anything was played: nothing is lost by starting anew.
+    head = partial.read_bytes().splitlines(keepends=True)[0]
+    partial.write_bytes(head)
+    protocol.evaluate("zero", TASK, path, episodes=1)
+    assert not partial.exists()
     partial.write_text("nonsense\n")
     with pytest.raises(OutputError, match="damaged"):
         protocol.evaluate("zero", TASK, path, episodes=2)
+    partial.unlink()
+    os.mkfifo(partial)
+    with pytest.raises(OutputError, match="no regular file"):
+        protocol.evaluate("zero", TASK, path, episodes=2)
+
+
+def test_a_second_evaluation_into_one_file_is_refused_and_the_first_goes_on(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "out.json"
+    refusals: list[str] = []
+
+    def start_another(trial: Any) -> None:
+        with pytest.raises(OutputError, match="another process is writing") as refusal:
+            protocol.evaluate("zero", TASK, path, episodes=2)
+        refusals.append(str(refusal.value))
+
+    first = protocol.evaluate("zero", TASK, path, episodes=2, progress=start_another)
+    assert len(refusals) == 2
+    assert result_file.load(path).episodes == first.episodes
+
+
+@pytest.mark.parametrize("room", ["half the trials", "all but the result"])
+def test_on_a_full_disk_nothing_is_lost(
+    room: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole, full = tmp_path / "whole.json", tmp_path / "full.json"
+    protocol.evaluate("random", TASK, whole, episodes=4)
+    size = interrupted(tmp_path / "size.json", "random", 4).stat().st_size
+    n_bytes = 2 * size if room == "half the trials" else whole.stat().st_size - 1
+    assert size < n_bytes
+    words = f"evaluate --policy random --task {TASK} --episodes 4 --out {full}".split()
+    code = (
+        "import resource, sys; from hvs_suite.cli.main import main\n"
+        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({n_bytes}, {n_bytes})); main(sys.argv[1:])"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1].startswith("hvs: cannot write")
+    assert "Traceback" not in done.stderr
+    assert not full.exists()
+    assert main.run(words) == 0
+    assert rows(full) == rows(whole)
+    assert not list(tmp_path.glob("full*.partial"))
+    capsys.readouterr()
 
 
 def test_several_tasks_write_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -314,3 +314,26 @@ def test_a_folder_has_one_writer_until_that_ends_however_it_ends(tmp_path):
         writer.kill()
     with claimed(tmp_path, {}):
         pass
+
+
+@pytest.mark.parametrize(
+    ("plumbing", "code"),
+    [
+        ("| true", 0),
+        (">&-", 0),
+        ("2>&-", 0),
+        (">&- 2>&-", 0),
+        ("2>&1 | true", 0),
+        (">/dev/full", 2),
+    ],
+)
+def test_an_evaluation_outlives_whoever_reads_along(plumbing, code, tmp_path):
+    hvs = f"{sys.executable} -c 'from hvs_suite.cli.main import main; main()'"
+    words = "evaluate --policy zero --episodes 1 --task align-fixed --task align-easy --out results"
+    script = f"set -o pipefail; {hvs} {words} {plumbing}"
+    done = subprocess.run(["bash", "-c", script], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == code
+    assert "Traceback" not in done.stderr
+    assert "Exception" not in done.stderr
+    written = {path.name for path in tmp_path.glob("results/*.json")}
+    assert written == {"align-fixed.json", "align-easy.json"}
