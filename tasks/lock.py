@@ -2,17 +2,21 @@
 
 ``lock.json`` holds, for every named task, its version and three digests: of its parameters, of the
 robot, and of its 1,000 test scenarios. Changing what a name means changes a digest and fails the
-tests until the version is raised and ``make certificates`` has written the lock anew.
+tests until the version is raised and ``hvs certify`` has written the task's entry anew.
 """
 
 import dataclasses
 import functools
 import hashlib
-import importlib.resources
 import json
+from pathlib import Path
 from typing import Any
 
-from hvs_suite.tasks.variants import AlignVariant
+from hvs_suite.errors import LockError
+from hvs_suite.files import replacing
+from hvs_suite.tasks.variants import TASKS, AlignVariant
+
+FILE = Path(__file__).resolve().parent / "lock.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,8 +44,7 @@ class LockEntry:
 @functools.cache
 def lock() -> dict[str, LockEntry]:
     """The entries of ``lock.json`` by task name."""
-    path = importlib.resources.files("hvs_suite.tasks") / "lock.json"
-    entries = json.loads(path.read_text(encoding="utf-8"))
+    entries = json.loads(FILE.read_text(encoding="utf-8"))
     return {name: LockEntry(**entry) for name, entry in entries.items()}
 
 
@@ -53,7 +56,14 @@ def digest(task: str) -> str:
 
     Returns:
         SHA-256, hexadecimal.
+
+    Raises:
+        LockError: The lock has no such task.
     """
+    if task not in lock():
+        raise LockError(
+            f"task {task!r} is not in the version lock; certify it with 'hvs certify {task}'"
+        )
     return lock()[task].digest
 
 
@@ -78,6 +88,50 @@ def compute_entry(variant: AlignVariant) -> LockEntry:
         robot=_sha256(robot_mjcf()),
         test_scenarios=_sha256(scenarios),
     )
+
+
+def agreed_entry(variant: AlignVariant) -> LockEntry:
+    """Compute what a variant means now, and hold it against the lock.
+
+    Args:
+        variant: A named task's parameters.
+
+    Returns:
+        The entry that may be stored.
+
+    Raises:
+        LockError: The lock says something else of the same or a later version.
+    """
+    entry, locked = compute_entry(variant), lock().get(variant.name)
+    if locked is not None and entry != locked and entry.version <= locked.version:
+        changed = ", ".join(
+            field.name
+            for field in dataclasses.fields(LockEntry)
+            if getattr(entry, field.name) != getattr(locked, field.name)
+        )
+        raise LockError(
+            f"{variant.name}-v{variant.version} no longer means what the version lock says "
+            f"(changed: {changed}); raise its version to {locked.version + 1}, then certify it"
+        )
+    return entry
+
+
+def store(task: str, entry: LockEntry) -> None:
+    """Write one task's entry; those of the other tasks stay as they are.
+
+    Args:
+        task: Registered name.
+        entry: What it means, from `agreed_entry`.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    entries = lock() | {task: entry}
+    order = [*(name for name in TASKS if name in entries), *(entries.keys() - TASKS.keys())]
+    with replacing(FILE) as path:
+        content = {name: dataclasses.asdict(entries[name]) for name in order}
+        path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    lock.cache_clear()
 
 
 def _fields(variant: AlignVariant) -> dict[str, Any]:

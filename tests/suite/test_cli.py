@@ -82,6 +82,7 @@ def test_words_that_make_no_sense_are_refused_in_one_line(words, reason, capsys)
         ["show", "align-thesys", "--out", "{folder}/picture.png"],
         ["view", "align-thesys", "--out", "{folder}/film.gif"],
         ["bench", "--task", "align-thesys"],
+        ["certify", "align-thesys"],
         ["record", "--task", "align-thesys", "--episodes", "1", "--out", "{folder}/data"],
         ["evaluate", "--policy", "zero", "--task", "align-thesys", "--out", "{folder}/r.json"],
     ],
@@ -106,6 +107,7 @@ def test_unknown_task_is_refused_with_the_nearest_name(words, tmp_path, capsys):
         (["record", "--task", "align-easy", "--episodes", "0", "--out", "{folder}/d"], "episodes"),
         (["record", "--task", "align-easy", "--episodes", "1", "--out", "{full}"], "--resume"),
         (["pretrain", "--data", "{folder}/none", "--out", "{folder}/p"], "none"),
+        (["certify", "align-easy", "--workers", "0"], "--workers"),
         (["demo", "--out", "{full}"], "--overwrite"),
     ],
 )  # fmt: skip
