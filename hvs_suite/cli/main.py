@@ -10,11 +10,11 @@ import importlib
 import inspect
 import io
 import logging
-import os
 import sys
 from collections.abc import Sequence
 from typing import Any, Protocol
 
+from hvs_suite.cli import streams
 from hvs_suite.errors import HvsError
 
 # Name -> where its dataclass lives. Those modules import nothing heavy at the top, so that
@@ -64,7 +64,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Args:
         arguments: Words after ``hvs``; those of the process by default.
     """
-    sys.exit(run(sys.argv[1:] if arguments is None else arguments))
+    streams.outlive_readers()
+    code = run(sys.argv[1:] if arguments is None else arguments)
+    if not streams.flush():
+        complain("standard output cannot be written: the device is full, say")
+        code = code or USER_ERROR
+    sys.exit(code)
 
 
 def run(arguments: Sequence[str]) -> int:
@@ -84,10 +89,6 @@ def run(arguments: Sequence[str]) -> int:
     except KeyboardInterrupt:
         complain("interrupted")
         return INTERRUPTED
-    except BrokenPipeError:
-        # `hvs tasks | head` closed the pipe; the interpreter's own flush at exit would complain.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
 
 
 def _quieten_libraries() -> None:

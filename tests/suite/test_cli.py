@@ -1,6 +1,7 @@
 """The ``hvs`` command as a person or a script meets it: output, exit codes, one-line errors."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -47,6 +48,36 @@ def test_hvs_is_installed_as_a_command():
         check=True,
     )
     assert "align-thesis-v1" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "stream", "codes"),
+    [
+        ("tasks", "stdout", (0, 0, 2)),
+        ("tasks --help", "stdout", (0, 0, 2)),
+        ("tasks", "stderr", (0, 0, 0)),
+        ("dance", "stderr", (2, 2, 2)),
+    ],
+)
+def test_a_stream_that_is_closed_unread_or_full_makes_no_noise(words, stream, codes):
+    command = [sys.executable, "-c", "from hvs_suite.cli.main import main; main()", *words.split()]
+    other = "stderr" if stream == "stdout" else "stdout"
+    normal = subprocess.run(command, capture_output=True)
+    number = {"stdout": 1, "stderr": 2}[stream]
+    closed = ["sh", "-c", f'exec "$@" {number}>&-', "sh", *command]
+    reader, unread = os.pipe()
+    os.close(reader)
+    with open("/dev/full", "wb") as full, os.fdopen(unread, "wb") as pipe:
+        ways = [(closed, None), (command, pipe), (command, full)]
+        for (way, to), code in zip(ways, codes, strict=True):
+            done = subprocess.run(way, **{stream: to, other: subprocess.PIPE})
+            said = getattr(done, other)
+            if to is full and stream == "stdout":
+                assert said.count(b"\n") == 1
+                assert said.startswith(b"hvs: standard output cannot be written")
+            else:
+                assert said == getattr(normal, other)
+            assert done.returncode == code
 
 
 def test_tasks_prints_json_that_a_script_can_read(capsys):
@@ -97,6 +128,14 @@ def test_unknown_task_is_refused_with_the_nearest_name(words, tmp_path, capsys):
     [
         (["show", "align-easy", "--out", "{file}/picture.png"], "choose another path"),
         (["show", "align-easy", "--out", "{folder}/picture.txt"], ".png"),
+        (["show", "align-easy", "--out", "{folder}/folder.png"], "is a folder"),
+        (["show", "align-easy", "--out", "{folder}/fifo.png"], "no regular file"),
+        (["show", "align-easy", "--out", "{folder}/" + 255 * "a" + ".png"], "too long"),
+        (["show", "align-easy", "--out", "/proc/picture.png"], "/proc"),
+        (["view", "align-easy", "--out", "{folder}/folder.gif"], "is a folder"),
+        (["view", "align-easy", "--out", "{folder}/f.gif", "--policy", "{file}"], "file"),
+        (["view", "align-easy", "--out", "{folder}/f.gif", "--policy", "{full}"], "config.json"),
+        (["tasks", "{folder}"], "Unrecognized"),
         (["view", "align-easy", "--out", "{folder}/film.mov"], ".mp4"),
         (["view", "align-easy", "--out", "{file}/film.gif"], "choose another path"),
         (["view", "align-easy", "--out", "{folder}/f.gif", "--scenario", "-1"], "-1"),
@@ -115,6 +154,9 @@ def test_bad_input_is_refused_in_one_line_that_says_why(words, reason, tmp_path,
     (tmp_path / "file").touch()
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").touch()
+    (tmp_path / "folder.png").mkdir()
+    (tmp_path / "folder.gif").mkdir()
+    os.mkfifo(tmp_path / "fifo.png")
     places = {"folder": tmp_path, "file": tmp_path / "file", "full": tmp_path / "full"}
     assert reason in refusal(capsys, *(word.format(**places) for word in words))
 
