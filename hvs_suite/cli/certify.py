@@ -32,7 +32,9 @@ class Certify:
         workers: Processes that play the expert.
     """
 
-    tasks: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="TASK ...")] = ()
+    tasks: Annotated[
+        tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[TASK ...]")
+    ] = ()
     workers: int = 1
 
     def run(self) -> int:

@@ -1,10 +1,14 @@
 """The ``hvs`` command as a person or a script meets it: output, exit codes, one-line errors."""
 
+import dataclasses
+import importlib
+import inspect
 import json
 import os
 import subprocess
 import sys
 
+import docstring_parser
 import pytest
 
 from hvs_suite.cli.main import COMMANDS, run
@@ -28,16 +32,36 @@ def refusal(capsys, *words):
     return err
 
 
-def test_help_names_every_command(capsys):
+def described(command):
+    """What a command's documentation says of itself and of each of its options."""
+    module, _, name = COMMANDS[command].partition(":")
+    said = docstring_parser.parse(inspect.getdoc(getattr(importlib.import_module(module), name)))
+    return said.short_description, {each.arg_name: each.description for each in said.params}
+
+
+def test_help_gives_every_command_a_line_of_its_own(capsys):
     assert run(["--help"]) == 0
-    text = capsys.readouterr().out
-    assert [name for name in COMMANDS if name not in text] == []
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
+    words = [line.split(maxsplit=1) for line in lines]
+    assert words == [[command, described(command)[0]] for command in COMMANDS]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_each_command_explains_each_of_its_options(command, capsys):
     assert run([command, "--help"]) == 0
-    assert f"usage: hvs {command}" in capsys.readouterr().out
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert f"usage: hvs {command}" in text
+    summary, options = described(command)
+    assert summary in text
+    module, _, name = COMMANDS[command].partition(":")
+    fields = dataclasses.fields(getattr(importlib.import_module(module), name))
+    assert [field.name for field in fields] == list(options)
+    for option, explanation in options.items():
+        before, found, _ = text.partition(" ".join(explanation.split()))
+        assert found, option
+        # What has no name is told by its place: a word without one, or a command of its own.
+        flag = f"--{option.replace('_', '-')}"
+        assert (flag in before.split()[-2:]) == (f"{flag} " in text)
 
 
 def test_hvs_is_installed_as_a_command():
