@@ -9,7 +9,6 @@ import pytest
 
 from hvs_suite.cli.main import run
 from hvs_suite.datasets import replay as film
-from hvs_suite.datasets.features import ERRORS
 from hvs_suite.datasets.reader import decode
 from hvs_suite.pictures import resize
 
@@ -58,7 +57,7 @@ def test_the_dot_of_now_stands_at_the_recorded_error(half, error, played):
     assert np.ptp(np.diff(across)) <= 1
     assert np.diff(across).min() > 5
     # The axis is logarithmic.
-    logs = np.log10([row[ERRORS][error] for row in rows()])
+    logs = np.log10([row["privileged.errors"][error] for row in rows()])
     slope, offset = np.polyfit(logs, down, 1)
     assert slope < -10
     np.testing.assert_allclose(np.polyval((slope, offset), logs), down, atol=2.5)
