@@ -33,7 +33,7 @@ lock:  ## resolve requirements.lock anew
 	  --no-annotate --no-header --no-emit-index-url --no-emit-find-links -o requirements.lock
 
 certificates: .venv/.up-to-date  ## certify the named tasks and write the version lock
-	@$(PY) -m hvs_suite.certify
+	@.venv/bin/hvs certify --workers 2
 
 clean:  ## remove .venv, runs and caches
 	rm -rf .venv runs build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

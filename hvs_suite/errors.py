@@ -17,6 +17,10 @@ class OptionError(HvsError, ValueError):
     """An option that does not exist or whose value makes no sense."""
 
 
+class LockError(HvsError, ValueError):
+    """A task that is not in the version lock, or means something else than the lock says."""
+
+
 class ActionError(HvsError, ValueError):
     """An action with NaN, infinity, a wrong shape, or values outside [-1, 1]."""
 

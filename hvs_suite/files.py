@@ -53,7 +53,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
         path: A file to be written later; missing parent folders are made now.
 
     Raises:
-        OutputError: The folder cannot be made or written, or a folder stands at ``path``.
+        OutputError: The folder cannot be made or written, or what stands at ``path`` is no file.
     """
     target = Path(path)
     try:
@@ -62,10 +62,22 @@ def check_writable(path: str | os.PathLike[str]) -> None:
         raise OutputError(
             f"cannot make the folder {target.parent}: {error.strerror}; choose another path"
         ) from error
-    if target.is_dir():
+    # Unlike pathlib's, these are just False for a name that cannot be.
+    if os.path.isdir(target):
         raise OutputError(f"{target} is a folder; name a file")
-    if not os.access(target.parent, os.W_OK):
-        raise OutputError(f"cannot write into {target.parent}; choose another path")
+    if os.path.exists(target) and not os.path.isfile(target):
+        # A FIFO or a device that is replaced is lost to whatever else uses it.
+        raise OutputError(f"{target} is no regular file; choose another path")
+    try:
+        # Permissions do not tell all: root has any, and some file systems take no files.
+        with tempfile.NamedTemporaryFile(
+            dir=target.parent, prefix=f".{target.stem}-", suffix=target.suffix
+        ):
+            pass
+    except OSError as error:
+        raise OutputError(
+            f"cannot write {target}: {error.strerror}; choose another path"
+        ) from error
 
 
 @contextlib.contextmanager

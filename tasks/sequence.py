@@ -179,11 +179,10 @@ class Sequence(Placing[SequenceSpec, SequenceScenario]):
         """Each target reachable and in time from the one before; observable and accurate."""
         from hvs_suite.tasks.shared import certificate
 
-        indices = list(scenarios)
         return [
-            *certificate.check_legs(env, indices, lambda scenario: scenario.targets),
-            *certificate.check_visibility(env, indices),
-            *certificate.check_accuracy(env, indices),
+            *certificate.check_legs(env, scenarios, lambda scenario: scenario.targets),
+            *certificate.check_visibility(env, scenarios),
+            *certificate.check_accuracy(env, scenarios),
         ]
 
 

@@ -275,11 +275,10 @@ class Track(Placing[TrackSpec, TrackScenario]):
         """The whole path reachable at a moderate speed; observable and accurate at its start."""
         from hvs_suite.tasks.shared import certificate
 
-        indices = list(scenarios)
         return [
-            *certificate.check_path(env, indices),
-            *certificate.check_visibility(env, indices),
-            *certificate.check_accuracy(env, indices),
+            *certificate.check_path(env, scenarios),
+            *certificate.check_visibility(env, scenarios),
+            *certificate.check_accuracy(env, scenarios),
         ]
 
 

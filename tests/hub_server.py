@@ -1,10 +1,13 @@
-"""A stand-in for the Hugging Face Hub's HTTP interface: takes what is pushed, in memory."""
+"""A stand-in for the Hugging Face Hub's HTTP interface: keeps what is pushed, and hands it out."""
 
 import base64
 import contextlib
+import hashlib
 import json
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+COMMIT = "0" * 40
 
 
 class Hub(ThreadingHTTPServer):
@@ -86,7 +89,29 @@ class Handler(BaseHTTPRequestHandler):
             self.answer({"commitUrl": url, "commitOid": "0" * 40, "success": True})
         elif self.command == "DELETE" and "/tag/" in path:
             self.answer({"error": "none"}, 404, {"X-Error-Code": "RevisionNotFound"})
+        elif "/tree/" in path:
+            self.answer(
+                [
+                    {"type": "file", "path": name, "size": len(content), "oid": "0" * 40}
+                    for name, content in hub.files.items()
+                ]
+            )
+        elif "/revision/" in path:
+            repository = path.partition("/revision/")[0].removeprefix("/api/models/")
+            names = [{"rfilename": name} for name in hub.files]
+            self.answer({"id": repository, "sha": COMMIT, "siblings": names})
+        elif f"/resolve/{COMMIT}/" in path:
+            self.hand_out(hub.files[path.partition(f"/resolve/{COMMIT}/")[2]])
         else:
             self.answer({})
+
+    def hand_out(self, content):
+        self.send_response(200)
+        self.send_header("ETag", f'"{hashlib.sha1(content).hexdigest()}"')
+        self.send_header("X-Repo-Commit", COMMIT)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(content)
 
     do_GET = do_POST = do_DELETE = do_HEAD = handle_any  # noqa: N815

@@ -14,6 +14,7 @@ import ctypes.util
 import importlib
 import os
 import sys
+import threading
 import weakref
 from typing import Any, Protocol
 
@@ -27,14 +28,37 @@ PACKAGES = {"egl": "libegl1", "osmesa": "libosmesa6", "glfw": "libgl1 and a disp
 _exit_calls: list["weakref.finalize[..., Any]"] = []
 
 
-class GLContext(Protocol):
+class _MujocoContext(Protocol):
     """What MuJoCo's context classes for EGL, OSMesa and GLFW have in common."""
+
+    def make_current(self) -> None: ...
+
+    def free(self) -> None: ...
+
+
+class GLContext:
+    """An OpenGL context that shares its thread with dm_control's own.
+
+    dm_control keeps a record of the context that it made current in each thread, and leaves out
+    the call where the record says that it still is. Its pictures would come from ours, grey or of
+    another scene, so we strike its record off whenever we change what is current.
+
+    Args:
+        context: MuJoCo's context.
+    """
+
+    def __init__(self, context: _MujocoContext) -> None:
+        self._context = context
 
     def make_current(self) -> None:
         """Direct the calling thread's OpenGL calls to this context."""
+        _strike_dm_control_off()
+        self._context.make_current()
 
     def free(self) -> None:
-        """Give the context back."""
+        """Give the context back; none is current in the calling thread after that."""
+        _strike_dm_control_off()
+        self._context.free()
 
 
 def choose_backend() -> str:
@@ -95,7 +119,7 @@ def create_context(width: int, height: int) -> GLContext:
             del sys.modules[name]
     try:
         module: Any = importlib.import_module(f"mujoco.{backend}")
-        context: GLContext = module.GLContext(width, height)
+        context = GLContext(module.GLContext(width, height))
         context.make_current()
     except Exception as error:  # each backend fails with its own exception types
         raise RenderError(
@@ -105,6 +129,16 @@ def create_context(width: int, height: int) -> GLContext:
             f"{', '.join(BACKENDS)}; 'hvs doctor' tells which work"
         ) from error
     return context
+
+
+def _strike_dm_control_off() -> None:
+    """Have dm_control make its context current again before it next draws in this thread."""
+    # Only now: importing it fixes the backend, which a context of ours has chosen.
+    from dm_control._render import base
+
+    current = base._CURRENT_CONTEXT_FOR_THREAD.pop(threading.current_thread(), None)
+    if current is not None:
+        del base._CURRENT_THREAD_FOR_CONTEXT[current]
 
 
 def free_at_exit(free: "weakref.finalize[..., Any]") -> None:

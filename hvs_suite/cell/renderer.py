@@ -39,16 +39,9 @@ class Renderer:
         self._model = model
         self._max_side = max_side
         self._gl = gl.create_context(max_side, max_side)
-        # MjrContext takes its sizes from the model; these are the only fields it reads from there.
-        model.vis.global_.offwidth = max_side
-        model.vis.global_.offheight = max_side
-        model.vis.quality.offsamples = multisampling
-        model.vis.quality.shadowsize = 4096 if studio else 0
-        try:
-            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-        except mujoco.FatalError as error:
-            raise RenderError(f"MuJoCo could not set up OpenGL: {error}") from error
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        self._context = offscreen_context(
+            model, max_side, multisampling, shadow_size=4096 if studio else 0
+        )
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR.value
         self._scene = mujoco.MjvScene(model, _MAX_GEOMS)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
@@ -180,6 +173,39 @@ class Renderer:
                 else np.empty((height, width), np.float32)
             )
         return self._buffers[key]
+
+
+def offscreen_context(
+    model: mujoco.MjModel, max_side: int, multisampling: int, *, shadow_size: int
+) -> mujoco.MjrContext:
+    """Upload a model into the current OpenGL context, with a frame buffer to draw it into.
+
+    Args:
+        model: Compiled model; comes back as it was.
+        max_side: Side of the frame buffer (px).
+        multisampling: Samples per pixel, 0 for none.
+        shadow_size: Side of the shadow map (px), 0 for no shadows.
+
+    Returns:
+        MuJoCo's context, which draws into the frame buffer.
+
+    Raises:
+        RenderError: The graphics library lacks what MuJoCo needs.
+    """
+    size, quality = model.vis.global_, model.vis.quality
+    kept = size.offwidth, size.offheight, quality.offsamples, quality.shadowsize
+    # MjrContext reads these from the model when it is made, and never after. Whoever else draws the
+    # model (dm_control, mujoco.Renderer) is to find the sizes that it was compiled with.
+    try:
+        size.offwidth = size.offheight = max_side
+        quality.offsamples, quality.shadowsize = multisampling, shadow_size
+        context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+    except mujoco.FatalError as error:
+        raise RenderError(f"MuJoCo could not set up OpenGL: {error}") from error
+    finally:
+        size.offwidth, size.offheight, quality.offsamples, quality.shadowsize = kept
+    mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
+    return context
 
 
 def _free(context: gl.GLContext, mujoco_context: mujoco.MjrContext) -> None:

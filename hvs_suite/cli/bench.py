@@ -214,19 +214,17 @@ class BareLoop:
         import mujoco
 
         from hvs_suite.cell.gl import create_context
+        from hvs_suite.cell.renderer import offscreen_context
 
         self._mujoco = mujoco
         self._model = env.physics.model.ptr
         self._data = mujoco.MjData(self._model)
         self._n_substeps = env.task.physics_steps_per_control_step
         side = max(env.variant.eih_resolution, env.variant.eth_resolution)
-        self._gl: Any = create_context(side, side)
-        self._model.vis.global_.offwidth = side
-        self._model.vis.global_.offheight = side
-        self._model.vis.quality.offsamples = env.variant.multisampling
-        self._model.vis.quality.shadowsize = 0
-        self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        self._gl = create_context(side, side)
+        self._context = offscreen_context(
+            self._model, side, env.variant.multisampling, shadow_size=0
+        )
         self._scene = mujoco.MjvScene(self._model, 256)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._scene.flags[flag] = False

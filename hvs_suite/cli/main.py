@@ -41,6 +41,7 @@ COMMANDS = {
     "leaderboard": "hvs_suite.cli.leaderboard:Leaderboard",
     "bench": "hvs_suite.cli.bench:Bench",
     "study": "hvs_suite.cli.study:Study",
+    "certify": "hvs_suite.cli.certify:Certify",
     "doctor": "hvs_suite.cli.doctor:Doctor",
     "demo": "hvs_suite.cli.demo:Demo",
     "reproduce": "hvs_suite.cli.reproduce:Reproduce",

@@ -25,7 +25,7 @@ from hvs_suite.cell.robot import (
 from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared import actions, appearance, observations, rewards
 from hvs_suite.tasks.shared.family import Family, Progress
-from hvs_suite.tasks.shared.goal import POSITION, TILT, Goal, Keypoint, Tip, goal_errors
+from hvs_suite.tasks.shared.goal import LATERAL, POSITION, TILT, Goal, Keypoint, Tip, goal_errors
 from hvs_suite.tasks.shared.scenario import Scenario, ScenarioSource
 from hvs_suite.tasks.shared.spec import CAMERA_NAMES, Spec
 
@@ -211,10 +211,40 @@ class ArmTask(composer.Task):
     def finish_step(
         self, physics: mjcf.Physics, *, steps: int, collided: bool, at_time_limit: bool
     ) -> None:
+        """Let the scene move on, measure errors, and judge the control step."""
+        self.family.advance(physics, steps * self.spec.control_period_s)
+        self._judge(physics, self.tip(physics), steps, collided=collided, over=at_time_limit)
+        self._reward_terms = rewards.reward_terms(self.spec, self._step_outcome(physics))
+
+    def judge_at(self, physics: mjcf.Physics, share: float, steps: int) -> tuple[Any, ...]:
+        """How a control step would be judged that ended with the tip beside its goal.
+
+        For the version lock, which covers the rule of success: the arm stays where it is.
+
+        Args:
+            physics: The compiled cell.
+            share: Distance from the goal along the surface, in units of the position's bound.
+            steps: Control steps since the reset.
+
+        Returns:
+            ``(n_inside, is_success, truncated, steps_to_goal)``.
+        """
+        self.family.advance(physics, steps * self.spec.control_period_s)
+        goal, bounds = self.goal(), self.spec.step_bounds
+        bound_mm = bounds.get(POSITION, bounds.get(LATERAL, 1.0))
+        along = np.cross(goal.normal, [0.0, 1.0, 0.0])
+        away = 1e-3 * share * bound_mm * along / np.linalg.norm(along)
+        tip = Tip(goal.position + away, -goal.normal)
+        at_limit = steps >= self.time_limit_steps
+        self._judge(physics, tip, steps, collided=False, over=at_limit)
+        return self._n_inside, self._success, self._truncated, self._steps_to_goal
+
+    def _judge(
+        self, physics: mjcf.Physics, tip: Tip, steps: int, *, collided: bool, over: bool
+    ) -> None:
         """Measure errors, count the hold, decide success, collision and truncation."""
         family = self.family
-        family.advance(physics, steps * self.spec.control_period_s)
-        errors = family.measure(self.tip(physics))
+        errors = family.measure(tip)
         inside = not collided and all(
             abs(errors[name]) <= bound for name, bound in self._step_bounds
         )
@@ -225,9 +255,8 @@ class ArmTask(composer.Task):
         self._errors = errors | family.tally(physics, errors, progress)
         self._success = not collided and family.is_complete(progress)
         self._steps_to_goal = family.steps_to_goal(progress) if self._success else None
-        time_is_up = at_time_limit or family.is_over(progress)
+        time_is_up = over or family.is_over(progress)
         self._truncated = time_is_up and not self._is_final
-        self._reward_terms = rewards.reward_terms(self.spec, self._step_outcome(physics))
 
     def _step_outcome(self, physics: mjcf.Physics) -> rewards.StepOutcome:
         """What the rewards of the control step depend on; costly parts only where asked for."""

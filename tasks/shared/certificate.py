@@ -2,17 +2,17 @@
 
 Four questions: can the goal be *reached* within the joint ranges; is there *time*; can the target
 be *seen* well enough for every tolerance; and is the task *solved* by the expert? The first three
-are answered here, by checks that families choose from; the fourth takes rollouts, so
-``hvs_suite.certify`` adds it. Scenarios are never
+are answered here, by checks that families choose from; the fourth takes rollouts, so ``hvs
+certify`` adds it. Scenarios are never
 filtered: a task that fails is changed instead.
 """
 
 import dataclasses
-import importlib.resources
 import itertools
 import json
 import math
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +20,8 @@ import numpy.typing as npt
 
 from hvs_suite.cell.kinematics import kinematics, travel_time
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
+from hvs_suite.errors import LockError
+from hvs_suite.files import replacing
 from hvs_suite.tasks.shared.detection import find_disc
 from hvs_suite.tasks.shared.goal import Goal
 from hvs_suite.tasks.shared.start import steps_lower_bound
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
 
 FloatArray = npt.NDArray[np.float64]
 
+FOLDER = Path(__file__).resolve().parents[1] / "certificates"
 MIN_JOINT_MARGIN_DEG = 2.0
 MIN_FOOTPRINT_PX = 3
 MAX_BUDGET = 0.8
@@ -97,12 +100,26 @@ def load_certificate(task: str) -> Certificate:
         task: Registered name.
 
     Raises:
-        FileNotFoundError: The task has not been certified, which the tests do not let pass.
+        LockError: The task has not been certified, which the tests do not let pass.
     """
-    folder = importlib.resources.files("hvs_suite.tasks") / "certificates"
-    stored = json.loads((folder / f"{task}.json").read_text(encoding="utf-8"))
+    try:
+        stored = json.loads((FOLDER / f"{task}.json").read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise LockError(
+            f"task {task!r} has no certificate; make one with 'hvs certify {task}'"
+        ) from error
     checks = tuple(Check(**check) for check in stored.pop("checks"))
     return Certificate(checks=checks, **stored)
+
+
+def store(certificate: Certificate) -> None:
+    """Write a certificate where `load_certificate` finds it.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    with replacing(FOLDER / f"{certificate.task}.json") as path:
+        path.write_text(certificate.to_json(), encoding="utf-8")
 
 
 def check_geometry(env: "Environment", scenarios: Iterable[int]) -> list[Check]:

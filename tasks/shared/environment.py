@@ -195,6 +195,15 @@ class Environment(composer.Environment):
         """Outcome so far; keys as in ``ArmTask.info``, and ``steps``."""
         return {**self._arm.info(), "steps": self._control_steps}
 
+    def judge(self, share: float, steps: int) -> tuple[Any, ...]:
+        """How a control step would be judged; see ``ArmTask.judge_at``."""
+        return self._arm.judge_at(self._physics_proxy, share, steps)
+
+    @property
+    def spec(self) -> Spec:
+        """The task's parameters."""
+        return self._arm.spec
+
     @property
     def variant(self) -> Spec:
         """The task's parameters."""

@@ -13,7 +13,7 @@ import dataclasses
 import importlib.metadata
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -67,6 +67,8 @@ class Family[S: Spec, C: Scenario](abc.ABC):
     """
 
     scenario: C
+    certificate_passes: ClassVar[int] = 3
+    """How often `certify` goes over the scenarios, for progress bars."""
 
     def __init__(self, spec: S, named: S | None = None) -> None:
         self.spec = spec
@@ -158,7 +160,7 @@ class Family[S: Spec, C: Scenario](abc.ABC):
 
         Args:
             env: A named task on its test split.
-            scenarios: Indices to check.
+            scenarios: Indices to check; gone over once for each group of checks.
         """
 
 

@@ -1,38 +1,55 @@
 """The version lock: what each task name means, as digests that the tests hold the code against.
 
-``lock.json`` holds, for every named task, its version and three digests: of its parameters, of the
-robot, and of its 1,000 test scenarios. Changing what a name means changes a digest and fails the
-tests until the version is raised and ``make certificates`` has written the lock anew.
+``tasks/lock.json`` holds, for every named task, its version and the digests of what makes it: the
+parameters, the robot, the scene, the test scenarios and the rule of success. Changing what a name
+means changes a digest and fails the tests until the version is raised and ``hvs certify`` has
+written the lock anew.
 """
 
 import dataclasses
 import functools
 import hashlib
-import importlib.resources
 import json
+from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hvs_suite.errors import LockError
+from hvs_suite.files import replacing
 from hvs_suite.tasks.shared.spec import Spec
 
 if TYPE_CHECKING:
-    from hvs_suite.tasks.shared.scenario import ScenarioSource
+    from hvs_suite.tasks.shared.environment import Environment
+
+FILE = Path(__file__).resolve().parents[1] / "lock.json"
+
+_SHARES = (0.0, 0.99, 1.01)
+"""Where the tip is put to find out how success is judged: shares of the position's bound."""
+_SCRIPTED_STEPS = 90
+_TEXTURE_SEED = 0
 
 
 @dataclasses.dataclass(frozen=True)
 class LockEntry:
-    """What a name means.
+    """What a name means, as SHA-256 digests.
 
     Attributes:
         version: Version of the task.
-        parameters: SHA-256 of the variant's fields.
-        robot: SHA-256 of the robot's MJCF: chain, inertia, gains, collision bodies.
-        test_scenarios: SHA-256 of the digests of all test scenarios in order.
+        parameters: Of its family and of the parameters that differ from the family's defaults, so
+            that a new parameter does not change what it leaves alone.
+        robot: Of the robot's MJCF: chain, inertia, gains, collision bodies.
+        scene: Of the whole cell's MJCF (markers, light, cameras, materials, meshes), and of one
+            painted texture where textures vary.
+        test_scenarios: Of the digests of all test scenarios in order.
+        rule: Of how scripted episodes are judged: held, solved, over.
     """
 
     version: int
     parameters: str
     robot: str
+    scene: str
     test_scenarios: str
+    rule: str
 
     @property
     def digest(self) -> str:
@@ -43,8 +60,7 @@ class LockEntry:
 @functools.cache
 def lock() -> dict[str, LockEntry]:
     """The entries of ``lock.json`` by task name."""
-    path = importlib.resources.files("hvs_suite.tasks") / "lock.json"
-    entries = json.loads(path.read_text(encoding="utf-8"))
+    entries = json.loads(FILE.read_text(encoding="utf-8"))
     return {name: LockEntry(**entry) for name, entry in entries.items()}
 
 
@@ -56,16 +72,22 @@ def digest(task: str) -> str:
 
     Returns:
         SHA-256, hexadecimal.
+
+    Raises:
+        LockError: The lock has no such task.
     """
+    if task not in lock():
+        raise LockError(
+            f"task {task!r} is not in the version lock; certify it with 'hvs certify {task}'"
+        )
     return lock()[task].digest
 
 
-def compute_entry(variant: Spec, source: "ScenarioSource") -> LockEntry:
-    """Compute what a variant means now.
+def compute_entry(env: "Environment") -> LockEntry:
+    """Compute what a task means now.
 
     Args:
-        variant: A named task's parameters.
-        source: Its test split.
+        env: The named task on its test split.
 
     Returns:
         The entry; draws all test scenarios, which takes seconds.
@@ -73,17 +95,97 @@ def compute_entry(variant: Spec, source: "ScenarioSource") -> LockEntry:
     from hvs_suite.cell.robot import robot_mjcf
     from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS
 
+    source = env.task.source
     scenarios = "".join(source.draw(index).digest() for index in range(TEST_SCENARIOS))
     return LockEntry(
-        version=variant.version,
-        parameters=_sha256(json.dumps(_fields(variant), sort_keys=True)),
+        version=env.spec.version,
+        parameters=_sha256(json.dumps(_parameters(env.spec), sort_keys=True)),
         robot=_sha256(robot_mjcf()),
+        scene=_sha256(_scene(env)),
         test_scenarios=_sha256(scenarios),
+        rule=_sha256(json.dumps(list(_judged(env)))),
     )
 
 
-def _fields(variant: Spec) -> dict[str, Any]:
-    return dataclasses.asdict(variant)
+def agreed_entry(env: "Environment") -> LockEntry:
+    """Compute what a task means now, and hold it against the lock.
+
+    Args:
+        env: The named task on its test split.
+
+    Returns:
+        The entry that may be stored.
+
+    Raises:
+        LockError: The lock says something else of the same or a later version.
+    """
+    name, version = env.spec.name, env.spec.version
+    entry, locked = compute_entry(env), lock().get(name)
+    if locked is not None and entry != locked and entry.version <= locked.version:
+        changed = ", ".join(
+            field.name
+            for field in dataclasses.fields(LockEntry)
+            if getattr(entry, field.name) != getattr(locked, field.name)
+        )
+        raise LockError(
+            f"{name}-v{version} no longer means what the version lock says "
+            f"(changed: {changed}); raise its version to {locked.version + 1}, then certify it"
+        )
+    return entry
+
+
+def store(task: str, entry: LockEntry) -> None:
+    """Write one task's entry; those of the other tasks stay as they are.
+
+    Args:
+        task: Registered name.
+        entry: What it means, from `agreed_entry`.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    entries = lock() | {task: entry}
+    with replacing(FILE) as path:
+        content = {name: dataclasses.asdict(entry) for name, entry in entries.items()}
+        path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    lock.cache_clear()
+
+
+def _parameters(spec: Spec) -> dict[str, Any]:
+    """Family, class of parameters, and every parameter that differs from its default."""
+    return {"family": spec.family} | {
+        field.name: getattr(spec, field.name)
+        for field in dataclasses.fields(spec)
+        if getattr(spec, field.name) != field.default
+    }
+
+
+def _scene(env: "Environment") -> str:
+    """The cell as text; numbers to eight digits, which no processor rounds differently."""
+    from hvs_suite.tasks.shared.appearance import surface_texture
+
+    text: str = env.task.root_entity.mjcf_model.to_xml_string(precision=8, zero_threshold=1e-10)
+    if env.spec.vary_texture:
+        text += _sha256(surface_texture(_TEXTURE_SEED).tobytes().hex())
+    return text
+
+
+def _judged(env: "Environment") -> Iterator[tuple[Any, ...]]:
+    """How the task judges a tip that is put inside or outside its bounds, step by step.
+
+    The arm stays where it is: what is looked at is the rule, and no physics.
+    """
+    env.draws = False
+    for share in _SHARES:
+        for rest in (0, 7):
+            env.reset(scenario=0)
+            for step in range(1, min(_SCRIPTED_STEPS, env.spec.time_limit_steps) + 1):
+                # With a rest, every so many steps the tip is far away.
+                away = 2.0 if rest and step % rest == 0 else share
+                yield env.judge(away, step)
+                if env.task.has_ended:
+                    break
+    env.draws = True
 
 
 def _sha256(text: str) -> str:

@@ -218,11 +218,10 @@ class Placing[S: PlacingSpec, C: Scenario](Family[S, C]):
         """Reachable, in time, observable and accurate."""
         from hvs_suite.tasks.shared import certificate
 
-        indices = list(scenarios)
         return [
-            *certificate.check_geometry(env, indices),
-            *certificate.check_visibility(env, indices),
-            *certificate.check_accuracy(env, indices),
+            *certificate.check_geometry(env, scenarios),
+            *certificate.check_visibility(env, scenarios),
+            *certificate.check_accuracy(env, scenarios),
         ]
 
 

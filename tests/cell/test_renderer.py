@@ -1,11 +1,14 @@
 """The kept renderer: owned copies, several at a time, processes that fork, machines without GL."""
 
+import contextlib
+import itertools
 import multiprocessing
 import os
 import subprocess
 import sys
 from collections.abc import Callable
 from multiprocessing.connection import Connection
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -27,6 +30,88 @@ def test_two_environments_draw_in_turn_without_disturbing_each_other() -> None:
         np.testing.assert_array_equal(one.reset(scenario=1).observation["eth"], alone)
         one.close()
         np.testing.assert_array_equal(other.reset(scenario=2).observation["eth"], there)
+
+
+def _env_render(env: Environment, _: contextlib.ExitStack) -> Callable[[], Any]:
+    return lambda: env.render(320, 240)
+
+
+def _physics_render(env: Environment, _: contextlib.ExitStack) -> Callable[[], Any]:
+    return lambda: env.physics.render(240, 320)
+
+
+def _mujoco_renderer(env: Environment, stack: contextlib.ExitStack) -> Callable[[], Any]:
+    renderer = stack.enter_context(mujoco.Renderer(env.physics.model.ptr, 240, 320))
+
+    def draw() -> Any:
+        renderer.update_scene(env.physics.data.ptr)
+        return renderer.render()
+
+    return draw
+
+
+def _another_environment_of_dm_control(
+    _: Environment, stack: contextlib.ExitStack
+) -> Callable[[], Any]:
+    # Only now: it starts Mesa, which has to hear first that it must not start threads.
+    from dm_control import suite
+
+    cartpole = stack.enter_context(suite.load("cartpole", "balance", task_kwargs={"random": 0}))
+    cartpole.reset()
+    return lambda: cartpole.physics.render(240, 320)
+
+
+DRAWERS = (
+    _env_render,
+    _physics_render,
+    _mujoco_renderer,
+    _another_environment_of_dm_control,
+)
+
+
+@pytest.fixture(scope="module")
+def alone() -> dict[Any, Any]:
+    """What each drawer draws where nothing else does, not even the task's own cameras."""
+    pictures = {}
+    for drawer in DRAWERS:
+        with (
+            contextlib.ExitStack() as stack,
+            hvs_suite.load("align-easy", split="test", observations="state") as env,
+        ):
+            env.reset(scenario=1)
+            pictures[drawer] = drawer(env, stack)()
+    assert min(picture.std() for picture in pictures.values()) > 10
+    return pictures
+
+
+@pytest.mark.parametrize("first", [1, -1], ids=["ours made first", "ours made last"])
+def test_all_who_draw_in_a_process_get_their_own_picture_in_any_order(
+    first: int, alone: dict[Any, Any], named: Named
+) -> None:
+    """dm_control takes the context that it made current last for current still."""
+    other = named("align-limit")
+    other_s = other.reset(scenario=2).observation["eth"]
+    with (
+        hvs_suite.load("align-easy", split="test") as env,
+        contextlib.ExitStack() as stack,
+    ):
+        ours = env.reset(scenario=1).observation["eth"]
+        made = {drawer: drawer(env, stack) for drawer in DRAWERS[::first]}
+        for order in (DRAWERS[::first], *itertools.permutations(DRAWERS)):
+            # MuJoCo's own renderer does not tell dm_control either, so one of ours draws between.
+            np.testing.assert_array_equal(other.reset(scenario=2).observation["eth"], other_s)
+            for drawer in order:
+                np.testing.assert_array_equal(made[drawer](), alone[drawer], str(order))
+        np.testing.assert_array_equal(env.reset(scenario=1).observation["eth"], ours)
+
+
+def test_freeing_a_context_leaves_dm_control_s_pictures_alone(alone: dict[Any, Any]) -> None:
+    with contextlib.ExitStack() as stack, hvs_suite.load("align-limit") as env:
+        draw = _another_environment_of_dm_control(env, stack)
+        env.reset(scenario=0)
+        draw()
+        env.close()
+        np.testing.assert_array_equal(draw(), alone[_another_environment_of_dm_control])
 
 
 def test_segmentation_tells_marker_surface_and_robot_apart(named: Named) -> None:

@@ -14,6 +14,7 @@ from hvs_suite.pictures import resize
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "align-thesis"
 DATA = "data/chunk-000/file-000.parquet"
+CURVE_COLOUR = (0xE9, 0x62, 0x0A)
 
 
 @pytest.fixture(scope="module")
@@ -42,9 +43,24 @@ def test_shows_the_pictures_of_the_dataset(played):
         np.testing.assert_array_equal(shown, resize(stored, side))
 
 
-def test_curves_move_on(played):
-    curves = [frame[film.HEAD + film.CELL_SIDE :] for frame in played.frames]
-    assert (curves[0] != curves[1]).any()
+@pytest.mark.parametrize(("half", "error"), [(0, 0), (1, 3)], ids=["position", "tilt"])
+def test_the_dot_of_now_stands_at_the_recorded_error(half, error, played):
+    columns = slice(half * film.WIDTH // 2, (half + 1) * film.WIDTH // 2)
+    dots = []
+    # The end's error is in no row of the dataset.
+    for frame in played.frames[:-1]:
+        curves = frame[film.HEAD + film.CELL_SIDE + film.MARGIN :, columns]
+        rows_px, columns_px = np.nonzero((curves == CURVE_COLOUR).all(axis=-1))
+        right = columns_px.max()
+        dots.append((right, rows_px[columns_px > right - 4].mean()))
+    across, down = np.array(dots).T
+    assert np.ptp(np.diff(across)) <= 1
+    assert np.diff(across).min() > 5
+    # The axis is logarithmic.
+    logs = np.log10([row["privileged.errors"][error] for row in rows()])
+    slope, offset = np.polyfit(logs, down, 1)
+    assert slope < -10
+    np.testing.assert_allclose(np.polyval((slope, offset), logs), down, atol=2.5)
 
 
 @pytest.mark.parametrize("suffix", ["gif", "mp4"])

@@ -3,11 +3,15 @@
 The Hub's client looks into a cache of the test's own, laid out as it does itself.
 """
 
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import huggingface_hub.constants
 import pytest
+from hub_server import running_hub
 
 from hvs_suite.cli import main
 from hvs_suite.errors import PolicyError
@@ -47,8 +51,30 @@ def test_what_was_never_fetched_is_refused_in_one_line_with_2(
     assert "someone/else" in complaint
 
 
-def test_no_code_and_no_pickle_is_ever_fetched() -> None:
-    assert hub.FILES == ("*.json", "*.safetensors")
+def test_no_code_and_no_pickle_is_ever_fetched(tmp_path: Path) -> None:
+    plain = {"config.json", "model.safetensors", "train/config.json"}
+    other = {"modeling.py", "pytorch_model.bin", "model.pkl", "train/optimizer.pt", "README.md"}
+    program = "from hvs_suite.policies import hub; print(hub.fetch('someone/servoing'))"
+    with running_hub() as server:
+        server.files = {name: name.encode() for name in plain | other}
+        done = subprocess.run(
+            [sys.executable, "-c", program],
+            env={
+                **os.environ,
+                "HF_HOME": str(tmp_path),
+                "HF_ENDPOINT": server.url,
+                "HF_HUB_OFFLINE": "0",
+            },
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == 0, done.stderr
+    folder = Path(done.stdout.strip())
+    fetched = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert fetched == plain
+    asked = [path.partition(f"/resolve/{'0' * 40}/")[2] for _, path in server.requests]
+    assert {name for name in asked if name} == plain
 
 
 @pytest.mark.parametrize("spec", ["a/b/c", "/absolute/path", "../up", "name", "a b/c", "a/b@"])

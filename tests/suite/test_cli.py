@@ -1,9 +1,14 @@
 """The ``hvs`` command as a person or a script meets it: output, exit codes, one-line errors."""
 
+import dataclasses
+import importlib
+import inspect
 import json
+import os
 import subprocess
 import sys
 
+import docstring_parser
 import pytest
 
 from hvs_suite.cli.main import COMMANDS, run
@@ -27,16 +32,36 @@ def refusal(capsys, *words):
     return err
 
 
-def test_help_names_every_command(capsys):
+def described(command):
+    """What a command's documentation says of itself and of each of its options."""
+    module, _, name = COMMANDS[command].partition(":")
+    said = docstring_parser.parse(inspect.getdoc(getattr(importlib.import_module(module), name)))
+    return said.short_description, {each.arg_name: each.description for each in said.params}
+
+
+def test_help_gives_every_command_a_line_of_its_own(capsys):
     assert run(["--help"]) == 0
-    text = capsys.readouterr().out
-    assert [name for name in COMMANDS if name not in text] == []
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
+    words = [line.split(maxsplit=1) for line in lines]
+    assert words == [[command, described(command)[0]] for command in COMMANDS]
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_each_command_explains_each_of_its_options(command, capsys):
     assert run([command, "--help"]) == 0
-    assert f"usage: hvs {command}" in capsys.readouterr().out
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert f"usage: hvs {command}" in text
+    summary, options = described(command)
+    assert summary in text
+    module, _, name = COMMANDS[command].partition(":")
+    fields = dataclasses.fields(getattr(importlib.import_module(module), name))
+    assert [field.name for field in fields] == list(options)
+    for option, explanation in options.items():
+        before, found, _ = text.partition(" ".join(explanation.split()))
+        assert found, option
+        # What has no name is told by its place: a word without one, or a command of its own.
+        flag = f"--{option.replace('_', '-')}"
+        assert (flag in before.split()[-2:]) == (f"{flag} " in text)
 
 
 def test_hvs_is_installed_as_a_command():
@@ -47,6 +72,36 @@ def test_hvs_is_installed_as_a_command():
         check=True,
     )
     assert "align-thesis-v1" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "stream", "codes"),
+    [
+        ("tasks", "stdout", (0, 0, 2)),
+        ("tasks --help", "stdout", (0, 0, 2)),
+        ("tasks", "stderr", (0, 0, 0)),
+        ("dance", "stderr", (2, 2, 2)),
+    ],
+)
+def test_a_stream_that_is_closed_unread_or_full_makes_no_noise(words, stream, codes):
+    command = [sys.executable, "-c", "from hvs_suite.cli.main import main; main()", *words.split()]
+    other = "stderr" if stream == "stdout" else "stdout"
+    normal = subprocess.run(command, capture_output=True)
+    number = {"stdout": 1, "stderr": 2}[stream]
+    closed = ["sh", "-c", f'exec "$@" {number}>&-', "sh", *command]
+    reader, unread = os.pipe()
+    os.close(reader)
+    with open("/dev/full", "wb") as full, os.fdopen(unread, "wb") as pipe:
+        ways = [(closed, None), (command, pipe), (command, full)]
+        for (way, to), code in zip(ways, codes, strict=True):
+            done = subprocess.run(way, **{stream: to, other: subprocess.PIPE})
+            said = getattr(done, other)
+            if to is full and stream == "stdout":
+                assert said.count(b"\n") == 1
+                assert said.startswith(b"hvs: standard output cannot be written")
+            else:
+                assert said == getattr(normal, other)
+            assert done.returncode == code
 
 
 def test_tasks_prints_json_that_a_script_can_read(capsys):
@@ -82,6 +137,7 @@ def test_words_that_make_no_sense_are_refused_in_one_line(words, reason, capsys)
         ["show", "align-thesys", "--out", "{folder}/picture.png"],
         ["view", "align-thesys", "--out", "{folder}/film.gif"],
         ["bench", "--task", "align-thesys"],
+        ["certify", "align-thesys"],
         ["record", "--task", "align-thesys", "--episodes", "1", "--out", "{folder}/data"],
         ["evaluate", "--policy", "zero", "--task", "align-thesys", "--out", "{folder}/r.json"],
     ],
@@ -96,6 +152,14 @@ def test_unknown_task_is_refused_with_the_nearest_name(words, tmp_path, capsys):
     [
         (["show", "align-easy", "--out", "{file}/picture.png"], "choose another path"),
         (["show", "align-easy", "--out", "{folder}/picture.txt"], ".png"),
+        (["show", "align-easy", "--out", "{folder}/folder.png"], "is a folder"),
+        (["show", "align-easy", "--out", "{folder}/fifo.png"], "no regular file"),
+        (["show", "align-easy", "--out", "{folder}/" + 255 * "a" + ".png"], "too long"),
+        (["show", "align-easy", "--out", "/proc/picture.png"], "/proc"),
+        (["view", "align-easy", "--out", "{folder}/folder.gif"], "is a folder"),
+        (["view", "align-easy", "--out", "{folder}/f.gif", "--policy", "{file}"], "file"),
+        (["view", "align-easy", "--out", "{folder}/f.gif", "--policy", "{full}"], "config.json"),
+        (["tasks", "{folder}"], "Unrecognized"),
         (["view", "align-easy", "--out", "{folder}/film.mov"], ".mp4"),
         (["view", "align-easy", "--out", "{file}/film.gif"], "choose another path"),
         (["view", "align-easy", "--out", "{folder}/f.gif", "--scenario", "-1"], "-1"),
@@ -106,6 +170,7 @@ def test_unknown_task_is_refused_with_the_nearest_name(words, tmp_path, capsys):
         (["record", "--task", "align-easy", "--episodes", "0", "--out", "{folder}/d"], "episodes"),
         (["record", "--task", "align-easy", "--episodes", "1", "--out", "{full}"], "--resume"),
         (["pretrain", "--data", "{folder}/none", "--out", "{folder}/p"], "none"),
+        (["certify", "align-easy", "--workers", "0"], "--workers"),
         (["demo", "--out", "{full}"], "--overwrite"),
     ],
 )  # fmt: skip
@@ -113,6 +178,9 @@ def test_bad_input_is_refused_in_one_line_that_says_why(words, reason, tmp_path,
     (tmp_path / "file").touch()
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").touch()
+    (tmp_path / "folder.png").mkdir()
+    (tmp_path / "folder.gif").mkdir()
+    os.mkfifo(tmp_path / "fifo.png")
     places = {"folder": tmp_path, "file": tmp_path / "file", "full": tmp_path / "full"}
     assert reason in refusal(capsys, *(word.format(**places) for word in words))
 

@@ -3,12 +3,17 @@
 import dataclasses
 import importlib.resources
 import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 import hvs_suite
 from hvs_suite.cell.kinematics import kinematics
+from hvs_suite.cli.main import run
 from hvs_suite.datasets.expert import make_expert
+from hvs_suite.errors import LockError
 from hvs_suite.rollout import run_episode
 from hvs_suite.tasks.shared import certificate, lock
 from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS
@@ -19,7 +24,7 @@ QUESTIONS = ("reachable", "in time", "observable", "accurate", "solved")
 
 @pytest.mark.parametrize("task", hvs_suite.TASKS)
 def test_a_name_means_what_the_lock_says(task: str) -> None:
-    """If this fails, raise the task's version and run ``python -m hvs_suite.certify``."""
+    """If this fails, raise the task's version and run ``hvs certify TASK``."""
     assert lock.compute_entry(hvs_suite.TASKS[task]) == lock.lock()[task]
 
 
@@ -148,3 +153,74 @@ def test_blind_starts_are_counted_and_leave_time_to_look(task: str) -> None:
         assert look.holds
         steps = int(look.found.removeprefix("max "))
         assert steps <= hvs_suite.TASKS[task].time_limit_steps
+
+
+@pytest.fixture
+def own_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[lock.LockEntry]:
+    """A lock and certificates of the test's own, and what align-easy means with 4 scenarios."""
+    certificates = shutil.copytree(certificate.FOLDER, tmp_path / "certificates")
+    monkeypatch.setattr(certificate, "FOLDER", certificates)
+    monkeypatch.setattr(lock, "FILE", Path(shutil.copy(lock.FILE, tmp_path)))
+    monkeypatch.setattr("hvs_suite.tasks.shared.scenario.TEST_SCENARIOS", 4)
+    lock.lock.cache_clear()
+    yield lock.compute_entry(hvs_suite.TASKS["align-easy"])
+    lock.lock.cache_clear()
+
+
+def written() -> dict[str, bytes]:
+    """Lock and certificates as they stand."""
+    return {path.name: path.read_bytes() for path in (lock.FILE, *certificate.FOLDER.iterdir())}
+
+
+@pytest.mark.parametrize("locked_version", [1, 2])
+def test_a_changed_task_is_certified_only_under_a_new_version(
+    own_lock: lock.LockEntry, locked_version: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    meant = dataclasses.replace(own_lock, version=locked_version, parameters="0" * 64)
+    lock.store("align-easy", meant)
+    before = written()
+    assert run(["certify", "align-easy"]) == 2
+    complaint = capsys.readouterr().err
+    assert len(complaint.splitlines()) == 1
+    assert "parameters" in complaint
+    assert f"raise its version to {locked_version + 1}" in complaint
+    assert written() == before
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["raised version", "new name"])
+def test_certifying_writes_the_named_task_and_leaves_the_others(
+    own_lock: lock.LockEntry, known: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    others = {name: entry for name, entry in lock.lock().items() if name != "align-easy"}
+    if known:
+        lock.store("align-easy", dataclasses.replace(own_lock, version=0, parameters="0" * 64))
+    else:
+        content = {name: dataclasses.asdict(entry) for name, entry in others.items()}
+        lock.FILE.write_text(json.dumps(content))
+        lock.lock.cache_clear()
+    before = written()
+    assert run(["certify", "align-easy"]) == 0
+    assert "4 test scenarios" in capsys.readouterr().out
+    assert lock.lock() == others | {"align-easy": own_lock}
+    assert list(lock.lock()) == list(hvs_suite.TASKS)
+    changed = {name for name, content in written().items() if content != before[name]}
+    assert changed == {"lock.json", "align-easy.json"}
+    made = certificate.load_certificate("align-easy")
+    assert (made.scenarios, made.digest, made.holds) == (4, own_lock.digest, True)
+
+
+def test_a_task_that_fails_a_check_is_not_locked(
+    own_lock: lock.LockEntry, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lock.store("align-easy", dataclasses.replace(own_lock, version=0))
+    monkeypatch.setattr(certificate, "MIN_JOINT_MARGIN_DEG", 180.0)
+    before = written()
+    assert run(["certify", "align-easy"]) == 1
+    assert "FAILS" in capsys.readouterr().out
+    assert written() == before
+
+
+def test_a_task_that_was_never_certified_is_a_sentence() -> None:
+    for ask in (lock.digest, certificate.load_certificate):
+        with pytest.raises(LockError, match="'hvs certify align-new'"):
+            ask("align-new")

@@ -36,10 +36,6 @@ def test_every_input_combination_of_the_thesis_is_there(observations: str) -> No
             spec.validate(time_step.observation[name])
 
 
-def test_there_are_twelve_of_them() -> None:
-    assert len(set(TWELVE)) == 12
-
-
 @pytest.mark.parametrize("task", hvs_suite.TASKS)
 def test_vision_holds_nothing_privileged_and_state_no_pictures(named: Named, task: str) -> None:
     assert list(named(task).observation_spec()) == [
