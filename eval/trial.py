@@ -258,9 +258,7 @@ class PlayTrial:
         return _play_policy(env, policy, scenario, self.decision_limit_s)
 
 
-def play_trial(
-    env: Stage, start: Callable[[], None], decide: Decide, scenario: int
-) -> Course:
+def play_trial(env: Stage, start: Callable[[], None], decide: Decide, scenario: int) -> Course:
     """Plays one scenario with a function of the observation.
 
     Args:

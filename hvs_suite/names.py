@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from hvs_suite.errors import HvsError
 
 LONGEST = 100
-# Printable, if one asks Python, and yet drawn as nothing: fillers, selectors, an empty Braille cell.
+# Printable for Python, and yet drawn as nothing: fillers, selectors, an empty Braille cell.
 _INVISIBLE = (
     (0x034F, 0x034F),
     (0x115F, 0x1160),
