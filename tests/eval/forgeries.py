@@ -108,7 +108,7 @@ def flattered(folder: Path, forged: Collection[int]) -> Path:
 
 
 def ground_sample(folder: Path) -> Path:
-    """400 forged rows, and blanks after the seal until a draw by the file's own hash misses them."""
+    """400 forged rows, and blanks after the seal until a draw by the file's hash misses them."""
     path = flattered(folder, range(400))
     begun = hashlib.sha256(path.read_bytes())
     for n in itertools.count():
