@@ -16,6 +16,7 @@ from hvs_suite.eval.board_tables import (
     joined,
 )
 from hvs_suite.eval.result_file import ERRORS, Metadata
+from hvs_suite.names import shown
 
 TITLES: Mapping[str, str] = {
     "position_error_mm": "position (mm)",
@@ -27,7 +28,7 @@ TITLES: Mapping[str, str] = {
 
 def identity(entry: Entry) -> str:
     """Returns the name of an entry's sheet, ``<task>/<policy>``."""
-    return f"{entry.task}/{entry.policy}"
+    return f"{entry.task}/{shown(entry.policy)}"
 
 
 def link(entry: Entry) -> str:

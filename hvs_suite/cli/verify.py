@@ -49,7 +49,7 @@ class Verify:
             for path in paths:
                 n = result_file.load(path).summary.n_episodes
                 n = n if self.sample is None else min(n, self.sample)
-                with console.progress(f"verify {shown(str(path))}", n) as advance:
+                with console.progress(f"verify {path}", n) as advance:
                     verdict = verification.verify(
                         path,
                         sample=self.sample,

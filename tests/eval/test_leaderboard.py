@@ -292,11 +292,12 @@ def test_a_hostile_name_stays_text() -> None:
 
 
 def test_what_is_not_seen_of_a_name_is_shown() -> None:
-    name = "a\u202eb\x1b[31m\n"
+    name = "a\u202eb\x1b[31m\n\ud800"
     for text in (page([made_up(name)]), board_tables.markdown([made_up(name)])):
         assert "\\u202eb\\x1b" in html.unescape(text)
         assert "\u202e" not in text
         assert "\x1b" not in text
+        assert text.encode()
 
 
 @pytest.mark.parametrize(
