@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from hvs_suite import files, registry
+from hvs_suite import files, reading, registry
+from hvs_suite.errors import OutputError, ResultError
 from hvs_suite.eval import action_log, result_file, trial
 from hvs_suite.eval.result_file import EpisodeRow, Result
 from hvs_suite.eval.submission import Submission
@@ -44,6 +45,8 @@ _STRIP: Final = 20
 SIZE: Final = (_CUT[2] - _CUT[0] + _CAMERA, 2 * _CAMERA + _STRIP)
 _QUALITY: Final = 45
 _LAST_FRAME_MS: Final = 1500
+# Twenty times the usual; all of them become part of one page.
+_MOST_BYTES: Final = 2**18
 _DARK, _LIGHT = (28, 31, 36), (236, 234, 230)
 
 
@@ -115,9 +118,11 @@ def clips(
         Clips by (policy, task), the success first.
 
     Raises:
-        OutputError: A clip cannot be written.
+        OutputError: A clip cannot be written, or there is a symbolic link in the folder.
         RenderError: Something is to be drawn and nothing here can.
+        ResultError: A clip that is there is no ordinary file, or is too large for a clip.
     """
+    _refuse_links(folder)
     orders = [
         _Order(entry, kind, row, _path(folder, entry, kind, row))
         for entry in submissions
@@ -136,7 +141,8 @@ def clips(
     found: dict[tuple[str, str], list[Clip]] = {}
     for order in orders:
         name = (order.submission.path.parent.name, order.submission.path.stem)
-        found.setdefault(name, []).append(Clip(order.kind, order.row, order.path.read_bytes()))
+        film = reading.read_bytes(order.path, most=_MOST_BYTES, error=ResultError, within=folder)
+        found.setdefault(name, []).append(Clip(order.kind, order.row, film))
     return found
 
 
@@ -202,6 +208,13 @@ def _frame(env: "Environment") -> "Image":
         # Flush right: digits that change stay in their places.
         draw.text((right, SIZE[1] - _STRIP + 3), text, _LIGHT, font(12), anchor="ra")
     return frame
+
+
+def _refuse_links(folder: Path) -> None:
+    """Raises OutputError where writing or removing would go through a link to somewhere else."""
+    for path in (folder, *sorted(folder.glob("*")), *sorted(folder.glob("*/*"))):
+        if path.is_symlink():
+            raise OutputError(f"{path} is a symbolic link; remove it, clips are kept in place")
 
 
 def _remove_all_but(kept: set[Path], folder: Path) -> None:

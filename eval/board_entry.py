@@ -1,14 +1,22 @@
 """The sheet that opens for one entry of the board: figures, clips, landings, what it was run on."""
 
 import base64
-import html
 import urllib.parse
 from collections.abc import Mapping, Sequence
 
 from hvs_suite.eval import board_clips, board_plots
 from hvs_suite.eval.board_clips import Clip
-from hvs_suite.eval.board_tables import DASH, SUCCESS, Entry, figure, iqm_interval, joined
+from hvs_suite.eval.board_tables import (
+    DASH,
+    SUCCESS,
+    Entry,
+    escaped,
+    figure,
+    iqm_interval,
+    joined,
+)
 from hvs_suite.eval.result_file import ERRORS, Metadata
+from hvs_suite.names import shown
 
 TITLES: Mapping[str, str] = {
     "position_error_mm": "position (mm)",
@@ -20,7 +28,7 @@ TITLES: Mapping[str, str] = {
 
 def identity(entry: Entry) -> str:
     """Returns the name of an entry's sheet, ``<task>/<policy>``."""
-    return f"{entry.task}/{entry.policy}"
+    return f"{entry.task}/{shown(entry.policy)}"
 
 
 def link(entry: Entry) -> str:
@@ -35,10 +43,10 @@ def sheet(entry: Entry, clips: Sequence[Clip]) -> str:
         entry: The entry.
         clips: Its clips; the page may have none.
     """
-    name = html.escape(identity(entry))
+    name = escaped(identity(entry))
     return f"""<dialog id="{name}" aria-labelledby="{name}-title">
-<header><h2 id="{name}-title">{html.escape(entry.policy)}
-<small>{html.escape(entry.task)}</small></h2>
+<header><h2 id="{name}-title">{escaped(entry.policy)}
+<small>{escaped(entry.task)}</small></h2>
 <form method="dialog"><button aria-label="Close">\N{MULTIPLICATION SIGN}</button></form></header>
 {_outcomes(entry)}
 {_films(clips)}
@@ -61,7 +69,7 @@ def _outcomes(entry: Entry) -> str:
         ("steps to goal, mean", figure(summary.steps_to_goal_mean)),
         ("× expert's steps", figure(entry.steps_over_expert)),
         ("steps out of range", str(summary.n_clipped)),
-        ("verified", f"{entry.played} scenarios played again"),
+        ("verified", entry.proof),
     ]
     return _list(rows, "figures")
 
@@ -83,7 +91,7 @@ def _films(clips: Sequence[Clip]) -> str:
         else:
             how = "not solved in time"
         where = f"{figure(row.settled_position_error_mm)} mm, {figure(row.settled_tilt_error_deg)}°"
-        caption = html.escape(f"Scenario {row.scenario}: {how}; ends at {where}.")
+        caption = escaped(f"Scenario {row.scenario}: {how}; ends at {where}.")
         data = base64.b64encode(clip.avif).decode("ascii")
         films.append(
             f'<figure><img loading="lazy" width="{width}" height="{height}" alt="{caption}" '
@@ -133,7 +141,7 @@ def _errors(entry: Entry) -> str:
         )
         rows.append(
             f'<tr><th scope="row">{TITLES[name]}</th>'
-            + "".join(f"<td>{html.escape(cell)}</td>" for cell in cells)
+            + "".join(f"<td>{escaped(cell)}</td>" for cell in cells)
             + "</tr>"
         )
     head = "".join(
@@ -175,7 +183,7 @@ def _origin(entry: Entry) -> str:
             ", ".join(f"{name} {version}" for name, version in metadata.packages.items()),
         ),
     ]
-    command = html.escape(f"hvs verify eval/results/{entry.policy}/{summary.task}.json")
+    command = escaped(f"hvs verify eval/results/{entry.policy}/{summary.task}.json")
     return (
         f"<details><summary>How it was made</summary>{_list(rows, 'origin')}"
         f"<p>Check it yourself: <code>{command}</code></p></details>"
@@ -184,8 +192,7 @@ def _origin(entry: Entry) -> str:
 
 def _list(rows: Sequence[tuple[str, str]], kind: str) -> str:
     items = "".join(
-        f"<div><dt>{html.escape(title)}</dt><dd>{html.escape(text)}</dd></div>"
-        for title, text in rows
+        f"<div><dt>{escaped(title)}</dt><dd>{escaped(text)}</dd></div>" for title, text in rows
     )
     return f'<dl class="{kind}">{items}</dl>'
 

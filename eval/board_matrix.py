@@ -1,11 +1,10 @@
 """The board's pairwise comparison: which policy beats which on the same scenarios."""
 
-import html
 import itertools
 from collections.abc import Mapping, Sequence
 
 from hvs_suite import statistics
-from hvs_suite.eval.board_tables import DASH, Entry
+from hvs_suite.eval.board_tables import DASH, Entry, escaped
 from hvs_suite.eval.comparison import SIGNIFICANT, Tally
 
 CAPTION = (
@@ -24,13 +23,12 @@ def matrix(entries: Sequence[Entry]) -> str:
     corrected = statistics.holm([tally.p for tally in tallies.values()])
     p_values = dict(zip(tallies, corrected, strict=True))
     head = "".join(
-        f'<th scope="col" data-policy="{html.escape(name)}">{html.escape(name)}</th>'
-        for name in outcomes
+        f'<th scope="col" data-policy="{escaped(name)}">{escaped(name)}</th>' for name in outcomes
     )
     rows = []
     for a in outcomes:
         cells = "".join(_cell(a, b, tallies, p_values) for b in outcomes)
-        name = html.escape(a)
+        name = escaped(a)
         rows.append(f'<tr data-policy="{name}"><th scope="row">{name}</th>{cells}</tr>')
     return (
         '<div class="sheet"><table class="matrix pairs"><thead><tr><td></td>'
@@ -44,7 +42,7 @@ def _cell(
     tallies: Mapping[tuple[str, str], Tally],
     p_values: Mapping[tuple[str, str], float],
 ) -> str:
-    column = f'data-policy="{html.escape(b)}"'
+    column = f'data-policy="{escaped(b)}"'
     if a == b:
         return f'<td class="self" {column}>{DASH}</td>'
     if (a, b) in tallies:
@@ -55,7 +53,7 @@ def _cell(
         only_a, only_b = tally.n_only_b, tally.n_only_a
     points = 100 * (only_a - only_b) / tally.n
     decided = "even" if p >= SIGNIFICANT else "better" if points > 0 else "worse"
-    told = html.escape(
+    told = escaped(
         f"{a} alone solves {only_a}, {b} alone {only_b}, both {tally.n_both}, neither "
         f"{tally.n_neither} of {tally.n}"
     )

@@ -4,7 +4,6 @@ Everything is in the file: style, script, plots and clips. The style and the scr
 module as ``board.css`` and ``board.js``.
 """
 
-import html
 import importlib.resources
 from collections.abc import Mapping, Sequence
 
@@ -15,6 +14,7 @@ from hvs_suite.eval.board_clips import Clip
 from hvs_suite.eval.board_tables import (
     COLUMNS,
     DASH,
+    DRAFT,
     NOTE,
     SUCCESS,
     VERIFIED,
@@ -23,6 +23,7 @@ from hvs_suite.eval.board_tables import (
     Overall,
     by_task,
     describe,
+    escaped,
     interval,
     overall,
     percent,
@@ -30,13 +31,17 @@ from hvs_suite.eval.board_tables import (
 
 
 def page(
-    entries: Sequence[Entry], clips: Mapping[tuple[str, str], Sequence[Clip]] | None = None
+    entries: Sequence[Entry],
+    clips: Mapping[tuple[str, str], Sequence[Clip]] | None = None,
+    *,
+    draft: bool = False,
 ) -> str:
     """Returns the whole page; the same entries and clips give the same text.
 
     Args:
         entries: One or more.
         clips: By (policy, task without version); none by default.
+        draft: Say that it is one.
     """
     tables = by_task(entries)
     # By name, not by rank: a policy keeps its colour when others come.
@@ -48,7 +53,7 @@ def page(
         for entry in table
     )
     links = "".join(
-        f'<a href="#{html.escape(task)}">{html.escape(table[0].result.summary.task)}</a>'
+        f'<a href="#{escaped(task)}">{escaped(table[0].result.summary.task)}</a>'
         for task, table in tables.items()
     )
     return f"""<!doctype html>
@@ -65,6 +70,7 @@ style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:">
 <body>
 <main>
 <h1>hvs_suite leaderboard</h1>
+{f"<p><strong>{escaped(DRAFT)}</strong></p>" if draft else ""}
 <p>A KUKA LBR iiwa 7 places its tool over a target that it sees with one camera in its hand and one
 looking on from above. Open a policy to see it succeed and fail, and where it lands.</p>
 <div class="bar-top"><input type="search" id="search" placeholder="Search policies"
@@ -75,7 +81,7 @@ aria-label="Search policies" autocomplete="off"><nav aria-label="Tasks">{links}
 <h2>All tasks</h2>
 <p>Mean success over all tasks; a task without a result counts as 0 %.</p>
 {_overall(overall(entries), list(tables), colours)}
-<details class="note"><summary>What the figures mean</summary><p>{html.escape(NOTE)}</p></details>
+<details class="note"><summary>What the figures mean</summary><p>{escaped(NOTE)}</p></details>
 </section>
 {sections}
 <section id="submit" class="prose">
@@ -98,7 +104,7 @@ def _overall(rows: Sequence[Overall], tasks: Sequence[str], colours: Mapping[str
     )
     body = []
     for row in rows:
-        name = html.escape(row.policy)
+        name = escaped(row.policy)
         cells = [
             f'<td data-value="{row.mean!r}"><b>{percent(row.mean)}</b>'
             f"<small>{interval(row.low, row.high)}</small>"
@@ -131,15 +137,15 @@ def _section(task: str, table: Sequence[Entry], colours: dict[str, int]) -> str:
         sorted_by=1,
     )
     options = "".join(
-        f'<option value="{index}"{" selected" if index == 1 else ""}>{html.escape(title)}</option>'
+        f'<option value="{index}"{" selected" if index == 1 else ""}>{escaped(title)}</option>'
         for index, title in enumerate(("policy", *(column.title for column in COLUMNS)))
     )
     rows = "\n".join(_row(entry, colours[entry.policy]) for entry in table)
     summary = table[0].result.summary
-    name = html.escape(task)
+    name = escaped(task)
     return f"""<section id="{name}">
 <h2>{name}</h2>
-<p>{html.escape(describe(summary.task))} Split <code>{html.escape(summary.split)}</code>.</p>
+<p>{escaped(describe(summary.task))} Split <code>{escaped(summary.split)}</code>.</p>
 <label>Sort by <select>{options}</select></label>
 <div class="sheet task sortable"><table><thead><tr>{head}</tr></thead>
 <tbody>
@@ -165,8 +171,7 @@ def _pairs(table: Sequence[Entry]) -> str:
     if len(table) < 2:
         return ""
     return (
-        f"<h3>Each with each</h3><p>{html.escape(board_matrix.CAPTION)}</p>"
-        f"{board_matrix.matrix(table)}"
+        f"<h3>Each with each</h3><p>{escaped(board_matrix.CAPTION)}</p>{board_matrix.matrix(table)}"
     )
 
 
@@ -175,13 +180,13 @@ def _head(columns: Sequence[tuple[str, bool]], sorted_by: int) -> str:
     return "".join(
         f'<th scope="col"{" data-down" if down else ""}'
         f"{' aria-sort=descending' if index == sorted_by else ''}>"
-        f'<button type="button">{html.escape(title)}</button></th>'
+        f'<button type="button">{escaped(title)}</button></th>'
         for index, (title, down) in enumerate(columns)
     )
 
 
 def _row(entry: Entry, colour: int) -> str:
-    name = html.escape(entry.policy)
+    name = escaped(entry.policy)
     cells = "".join(_figure(column, entry) for column in COLUMNS)
     return (
         f'<tr data-policy="{name}"><th scope="row" data-value="{name}">{_swatch(colour)}'
@@ -191,22 +196,24 @@ def _row(entry: Entry, colour: int) -> str:
 
 def _figure(column: Column, entry: Entry) -> str:
     value = column.value(entry)
-    text = html.escape(column.text(entry))
-    below = html.escape(column.interval(entry))
+    text = escaped(column.text(entry))
+    below = escaped(column.interval(entry))
     kind = ""
     if column is SUCCESS:
         text = f"<b>{text}</b> <small>{below}</small>{_bar(entry)}"
         kind = ' class="success"'
     elif column is VERIFIED:
         whole = " whole" if entry.n_played == entry.result.summary.n_episodes else ""
-        text = (
-            f'<span class="badge{whole}" title="Scenarios whose logged actions were played again '
-            f'and gave the same numbers">\N{CHECK MARK} {text}</span>'
+        proven = (
+            "Replayed: the logged actions give these numbers."
+            if entry.rerun is None
+            else "Re-run: the maintainers ran the policy itself on scenarios nobody had seen."
         )
+        text = f'<span class="badge{whole}" title="{proven}">\N{CHECK MARK} {text}</span>'
     elif below:
         text += f" <small>{below}</small>"
     return (
-        f'<td{kind} data-title="{html.escape(column.title)}" '
+        f'<td{kind} data-title="{escaped(column.title)}" '
         f'data-value="{"" if value is None else repr(float(value))}">{text}</td>'
     )
 
@@ -218,7 +225,7 @@ def _landing(entry: Entry) -> str:
     plot = board_plots.landing_plot(
         rows, 2 * tolerance, tolerance, f"Landings of {entry.policy} around the target"
     )
-    name = html.escape(entry.policy)
+    name = escaped(entry.policy)
     return (
         f'<figure data-policy="{name}">{plot}<figcaption><b>{name}</b> {inside} of {len(rows)} in '
         "the picture</figcaption></figure>"
@@ -227,8 +234,8 @@ def _landing(entry: Entry) -> str:
 
 def _legend(table: Sequence[Entry], colours: Mapping[str, int]) -> str:
     buttons = "".join(
-        f'<button type="button" data-policy="{html.escape(entry.policy)}">'
-        f"{_swatch(colours[entry.policy])}{html.escape(entry.policy)}</button>"
+        f'<button type="button" data-policy="{escaped(entry.policy)}">'
+        f"{_swatch(colours[entry.policy])}{escaped(entry.policy)}</button>"
         for entry in table
     )
     return (

@@ -6,7 +6,6 @@ from the page's style by class, and the same numbers give the same bytes.
 """
 
 import dataclasses
-import html
 import math
 from collections.abc import Sequence
 from typing import Final
@@ -14,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from hvs_suite import statistics
-from hvs_suite.eval.board_tables import Entry, figure
+from hvs_suite.eval.board_tables import Entry, escaped, figure
 from hvs_suite.eval.result_file import EpisodeRow
 
 # A curve's plot in user units; shown at about 1.3 px a unit on a desktop, 1 px on a phone.
@@ -102,7 +101,7 @@ def landing_plot(
     unit = half / radius_mm
     parts = [
         f'<svg class="landing" viewBox="0 0 {_LANDING} {_LANDING}" role="img" '
-        f'aria-label="{html.escape(title)}">',
+        f'aria-label="{escaped(title)}">',
         f'<path class="grid" d="M{half:g} 0v{_LANDING}M0 {half:g}h{_LANDING}"/>',
     ]
     if tolerance_mm <= radius_mm:
@@ -197,7 +196,7 @@ def _plot(
     if mark is not None:
         parts.append(f'<path class="goal" d="M{mark:.1f} {_TOP}V{_BOTTOM}"/>')
     parts.append(
-        f'<text class="middle" x="{middle:g}" y="{_HEIGHT - 6}">{html.escape(x_label)}</text>'
+        f'<text class="middle" x="{middle:g}" y="{_HEIGHT - 6}">{escaped(x_label)}</text>'
         f'<text class="middle" transform="translate(12 {(_TOP + _BOTTOM) / 2:g}) rotate(-90)">'
         "success (%)</text>"
     )
@@ -211,7 +210,7 @@ def _plot(
         broken = " broken" if line.colour >= COLOURS else ""
         parts.append(
             f'<g class="c{line.colour % COLOURS}{broken}" '
-            f'data-policy="{html.escape(line.policy)}">'
+            f'data-policy="{escaped(line.policy)}">'
             f'<path class="zone" d="M{upper}L{lower}Z"/>'
             f'<path class="line" d="M{_path(xs, line.pc_success, stairs=stairs)}"/></g>'
         )

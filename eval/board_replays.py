@@ -1,44 +1,44 @@
 """Which results were played again before they went on the board, and how many scenarios of each.
 
-``verified.json`` beside the board remembers it by each file's hash, so that a build plays only what
-is new and needs no simulator where nothing is. It is a note, not evidence: the tests play a sample
-of every committed result again, and anybody may with ``hvs verify``.
+Whoever builds the board finds that out by playing them. A ledger remembers it by each file's
+content, so that a build plays only what is new. It lies among the builder's own files, never among
+what is submitted: what comes with a result is a claim.
 """
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+import os
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Final
 
 import pydantic
 
-from hvs_suite import files
+from hvs_suite import files, reading
 from hvs_suite.errors import OptionError, ResultError
-from hvs_suite.eval import action_log, result_file, verification
+from hvs_suite.eval import verification
 from hvs_suite.eval.submission import Submission
 
-LEDGER: Final = "verified.json"
 SAMPLE: Final = 20
 """Scenarios of a new result that a build plays: a second a result, and one altered row in ten does
 not get past it seven times out of eight."""
 
+Digest = Annotated[str, pydantic.Field(pattern="^[0-9a-f]{64}$")]
 
-class Replay(pydantic.BaseModel):
-    """What was found out about a result.
 
-    Attributes:
-        sha256: SHA-256 of the result file, which names the action log's.
-        n_played: Scenarios that were played again, and came out as the file says.
-    """
+class _Ledger(pydantic.BaseModel):
+    """How many scenarios were played, by the SHA-256 of the result, which names the log's."""
 
     model_config = pydantic.ConfigDict(extra="forbid", strict=True, frozen=True)
 
-    sha256: Annotated[str, pydantic.Field(pattern="^[0-9a-f]{64}$")]
-    n_played: Annotated[int, pydantic.Field(ge=1)]
+    played: dict[Digest, Annotated[int, pydantic.Field(ge=1)]]
 
 
-_LEDGER = pydantic.TypeAdapter(dict[str, Replay])
+def own_ledger() -> Path:
+    """Returns where this user's ledger lies: in ``$XDG_CACHE_HOME``, or ``~/.cache``."""
+    cache = os.environ.get("XDG_CACHE_HOME", "")
+    folder = Path(cache) if Path(cache).is_absolute() else Path.home() / ".cache"
+    return folder / "hvs_suite" / "replays.json"
 
 
 def check(
@@ -47,61 +47,57 @@ def check(
     *,
     sample: int = SAMPLE,
     say: Callable[[str], None] = lambda line: None,
-) -> dict[str, Replay]:
-    """Plays results again, unless the ledger says that it was done.
+) -> dict[str, int]:
+    """Plays results again, unless the ledger says that it was done, and notes it there.
 
     Args:
         submissions: Results, each in its ``<policy>/<task>.json``.
-        ledger: File of an earlier build; may be missing. It is not written, see `write`.
-        sample: Scenarios of each to play, drawn by the file's hash; at least 1.
+        ledger: File of earlier builds; made if missing.
+        sample: Scenarios of each to play, drawn anew for each build; at least 1.
         say: Told about each that is played.
 
     Returns:
-        The ledger as it is now, by ``<policy>/<task>``.
+        How many scenarios of each were asked for and came out again, by ``<policy>/<task>``.
 
     Raises:
-        ResultError: An action log is not the one of its result, a result does not come out again,
-            or the ledger is malformed.
+        ResultError: A result does not come out again, or the ledger is malformed.
         OptionError: `sample` is below 1.
+        OutputError: The ledger cannot be written.
     """
     if sample < 1:
         raise OptionError(f"at least 1 scenario of each result is played again, not {sample}")
+    files.check_writable(ledger)
     known = _read(ledger)
-    found: dict[str, Replay] = {}
+    nonce = verification.new_nonce()
+    found: dict[str, int] = {}
     for entry in submissions:
         name = f"{entry.path.parent.name}/{entry.path.stem}"
-        sha256 = hashlib.sha256(entry.path.read_bytes()).hexdigest()
-        replay = known.get(name)
         n_wanted = min(sample, entry.result.summary.n_episodes)
-        if replay is None or replay.sha256 != sha256 or replay.n_played < n_wanted:
-            say(f"playing {n_wanted} scenarios of {name} again")
-            verdict = verification.verify(entry.path, sample=sample)
-            replay = Replay(sha256=sha256, n_played=verdict.n_played)
-        else:
-            log = result_file.actions_path(entry.path)
-            if action_log.digest(log) != entry.result.metadata.actions_sha256:
-                raise ResultError(f"{log}: is not the action log that its result was written with")
-        found[name] = replay
+        sha256 = hashlib.sha256(entry.path.read_bytes()).hexdigest()
+        if known.get(sha256, 0) < n_wanted:
+            drawn = f", drawn with nonce {nonce}" if sample == n_wanted else ""
+            say(f"playing {n_wanted} scenarios of {name} again{drawn}")
+            verdict = verification.verify(entry.path, sample=sample, nonce=nonce)
+            known[sha256] = verdict.n_played
+            # At once: a later result that is refused does not make this one be played again.
+            _write(ledger, known)
+        found[name] = n_wanted
     return found
 
 
-def write(ledger: Path, replays: Mapping[str, Replay]) -> None:
-    """Writes the ledger; equal content gives equal bytes.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
-    content = {name: replays[name].model_dump() for name in sorted(replays)}
+def _write(ledger: Path, played: dict[str, int]) -> None:
     with files.replacing(ledger) as temporary:
-        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8", newline="\n")
+        content = _Ledger(played=dict(sorted(played.items()))).model_dump()
+        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
-def _read(ledger: Path) -> dict[str, Replay]:
-    try:
-        return _LEDGER.validate_json(ledger.read_bytes())
-    except FileNotFoundError:
+def _read(ledger: Path) -> dict[str, int]:
+    if not ledger.exists():
         return {}
-    except (OSError, ValueError) as error:
+    try:
+        content = reading.read_json(ledger, error=ResultError)
+        return dict(reading.validated(_Ledger, content, ledger, error=ResultError).played)
+    except ResultError as error:
         raise ResultError(
-            f"{ledger}: is no ledger of replays; delete it and build again"
+            f"{ledger}: is no ledger of replays; delete it and build again ({error})"
         ) from error

@@ -1,12 +1,13 @@
 """What the board shows, whatever draws it: entries, their order, columns, and Markdown."""
 
 import dataclasses
+import html
 from collections.abc import Callable, Mapping, Sequence
 
 from hvs_suite import registry, statistics
-from hvs_suite.eval.board_replays import Replay
 from hvs_suite.eval.result_file import Result, SettledErrorSummary
 from hvs_suite.eval.submission import Submission
+from hvs_suite.names import shown
 from hvs_suite.registry import TASKS
 
 NOTE = (
@@ -15,8 +16,15 @@ NOTE = (
     "solve. Settled errors are taken at the time limit, the goal not ending the episode, over all "
     "episodes, failures included: interquartile mean with its bootstrap interval, and 95th "
     "percentile. The sharpest tolerance is the multiple of the task's own that 95 % of the "
-    "scenarios settle within. Every result was verified: the logged actions of some or all of its "
-    "scenarios were played again and gave the same numbers."
+    "scenarios settle within. Verified says what is proven. Replayed: the logged actions of so "
+    "many scenarios, drawn after the result was handed in, were played again and gave the same "
+    "numbers; that the named policy chose them, and how fast, is its submitter's word. Re-run: the "
+    "maintainers ran the policy themselves, its weights or its server, on scenarios that nobody "
+    "had seen, and reached a success that agrees."
+)
+DRAFT = (
+    "This is a draft: results on it may hold fewer scenarios than a score takes, and nobody has "
+    "held them against the rules of the board."
 )
 DASH = "\N{EN DASH}"
 
@@ -31,12 +39,14 @@ class Entry:
         n_played: Scenarios whose actions were played again, and gave the same numbers.
         steps_over_expert: Steps to goal over the expert's, on the scenarios that both solved; None
             where there are none, or no expert on the board.
+        rerun: What the maintainers found when they ran the policy themselves; None if they did not.
     """
 
     policy: str
     result: Result
     n_played: int
     steps_over_expert: float | None = None
+    rerun: Result | None = None
 
     @property
     def task(self) -> str:
@@ -44,10 +54,14 @@ class Entry:
         return f"{self.result.summary.task}-v{self.result.metadata.task_version}"
 
     @property
-    def played(self) -> str:
-        """How much of it was played again, such as ``20 of 1000``."""
+    def proof(self) -> str:
+        """What is proven of it, such as ``replayed 20 of 1000``; `NOTE` says what that means."""
         n = self.result.summary.n_episodes
-        return f"all {n}" if self.n_played == n else f"{self.n_played} of {n}"
+        replayed = f"replayed {'all' if self.n_played == n else f'{self.n_played} of'} {n}"
+        if self.rerun is None:
+            return replayed
+        summary = self.rerun.summary
+        return f"{replayed}, re-run: {summary.n_success} of {summary.n_episodes} solved"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +90,7 @@ SUCCESS = Column(
     larger_first=True,
     interval=lambda e: interval(*e.result.summary.pc_success_ci95),
 )
-VERIFIED = Column("verified", lambda e: e.n_played, lambda e: e.played, larger_first=True)
+VERIFIED = Column("verified", lambda e: e.n_played, lambda e: e.proof, larger_first=True)
 COLUMNS = (
     SUCCESS,
     Column(
@@ -131,30 +145,33 @@ COLUMNS = (
 
 
 def make_entries(
-    submissions: Sequence[Submission], replays: Mapping[str, Replay] | None = None
+    submissions: Sequence[Submission],
+    replays: Mapping[str, int] | None = None,
+    reruns: Mapping[str, Result] | None = None,
 ) -> list[Entry]:
     """Returns what the board shows of checked results.
 
     Args:
         submissions: One a policy and task.
-        replays: What was played again, by ``<policy>/<task>``; nothing by default.
+        replays: How many scenarios were played again, by ``<policy>/<task>``; none by default.
+        reruns: What the maintainers ran themselves, likewise.
     """
     experts = {
         entry.result.summary.task: entry.result
         for entry in submissions
-        if entry.result.metadata.policy_kind == "builtin"
-        and entry.result.summary.policy == "expert"
+        if entry.result.metadata.policy_kind == "builtin" and entry.path.parent.name == "expert"
     }
     entries = []
     for entry in submissions:
-        replay = (replays or {}).get(f"{entry.path.parent.name}/{entry.path.stem}")
+        name = f"{entry.path.parent.name}/{entry.path.stem}"
         expert = experts.get(entry.result.summary.task)
         entries.append(
             Entry(
                 entry.path.parent.name,
                 entry.result,
-                replay.n_played if replay else 0,
+                (replays or {}).get(name, 0),
                 None if expert is None else _steps_over(entry.result, expert),
+                (reruns or {}).get(name),
             )
         )
     return entries
@@ -249,12 +266,18 @@ def describe(task: str) -> str:
     )
 
 
-def markdown(entries: Sequence[Entry]) -> str:
-    """Returns the board as Markdown; the same entries give the same text."""
+def markdown(entries: Sequence[Entry], *, draft: bool = False) -> str:
+    """Returns the board as Markdown; the same entries give the same text.
+
+    Args:
+        entries: One or more.
+        draft: Say that it is one.
+    """
     tables = by_task(entries)
     lines = [
         "# Leaderboard",
         "",
+        *([f"**{DRAFT}**", ""] if draft else []),
         "`leaderboard.html` beside this file shows more: curves, landings, comparisons and clips. "
         "[SUBMITTING.md](SUBMITTING.md) says how to add a policy.",
         "",
@@ -335,6 +358,11 @@ def _steps_over(result: Result, expert: Result) -> float | None:
     return sum(row.steps for row in both) / sum(theirs[row.scenario] for row in both)
 
 
+def escaped(text: str) -> str:
+    """Returns text that HTML, and whoever reads it, takes for nothing but what it is."""
+    return html.escape(shown(text))
+
+
 def _cell(entry: Entry | None) -> str:
     if entry is None:
         return DASH
@@ -352,6 +380,7 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 def _plain(text: str) -> str:
     """Returns text that Markdown takes for nothing but text."""
+    text = shown(text)
     for character in "\\|`<>[]*_":
         text = text.replace(character, f"&#{ord(character)};")
     return text

@@ -1,11 +1,10 @@
 """Two policies on the same scenarios: who is better, and how sure one can be of it."""
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
-from hvs_suite import statistics
+from hvs_suite import reading, statistics
 from hvs_suite.errors import ResultError
 from hvs_suite.eval import lerobot_import, result_file
 from hvs_suite.eval.result_file import EpisodeRow
@@ -202,12 +201,8 @@ def load_side(path: Path) -> Side:
     Raises:
         ResultError: It is neither.
     """
-    try:
-        imported = lerobot_import.is_imported(json.loads(path.read_bytes()))
-    except (OSError, ValueError):
-        # The reader below says it better.
-        imported = False
-    if imported:
+    content = reading.read_json(path, error=ResultError, most=result_file.MOST_BYTES)
+    if lerobot_import.is_imported(content):
         claim = lerobot_import.load(path)
         return Side(
             name=claim.summary.policy,

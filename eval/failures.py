@@ -21,6 +21,7 @@ from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.errors import ResultError
 from hvs_suite.eval import action_log, result_file
 from hvs_suite.eval.result_file import EpisodeRow
+from hvs_suite.names import shown
 from hvs_suite.policies.checkpoint import load_network, network_inputs, read_config
 from hvs_suite.rollout import Action, Observation, one_torch_thread
 from hvs_suite.tasks.shared.spec import Spec
@@ -233,7 +234,7 @@ def markdown(reports: Sequence[Report]) -> str:
     for report in reports:
         counts = Counter(failure.cause for failure in report.failures)
         lines += [
-            f"`{report.policy}` on `{report.task}`, split `{report.split}`: "
+            f"`{shown(report.policy)}` on `{report.task}`, split `{report.split}`: "
             f"{len(report.failures)} of {report.n_episodes} lost.",
             "",
         ]

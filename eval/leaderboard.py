@@ -1,12 +1,12 @@
 """Builds the board from result files: Markdown, and one web page that needs no network.
 
 Run as ``python eval/leaderboard.py`` or ``hvs leaderboard``. Results lie as
-``<results>/<policy>/<task>.json`` with their action logs beside them. One that is malformed,
-altered, a duplicate, made with another version of its task, or does not come out again when its
-actions are played stops the build with the reason: a board is only as good as its worst row.
+``<results>/<policy>/<task>.json`` with their action logs beside them. One that breaks a rule of
+`submission.check`, or does not come out again when its actions are played, stops the build with the
+reason: a board is only as good as its worst row.
 
-Equal results give equal bytes, on any machine, as long as ``clips`` and ``verified.json`` stay
-beside the board: what was drawn and played once is not drawn and played again.
+Equal results give equal bytes, on any machine, as long as ``clips`` stays beside the board. What
+was played again once is not played again on the same machine; see `board_replays`.
 """
 
 import argparse
@@ -15,12 +15,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from hvs_suite import files
-from hvs_suite.errors import HvsError, ResultError
-from hvs_suite.eval import board_clips, board_replays, result_file, submission
+from hvs_suite.errors import HvsError, OptionError
+from hvs_suite.eval import board_clips, board_replays, board_reruns, submission
 from hvs_suite.eval.board_page import page
 from hvs_suite.eval.board_tables import make_entries, markdown
-from hvs_suite.eval.submission import Submission
-from hvs_suite.eval.verification import check_task
+from hvs_suite.names import shown
 
 RESULTS = Path("eval/results")
 OUT = Path("eval")
@@ -31,15 +30,22 @@ def build(
     out: Path = OUT,
     *,
     replay: int = board_replays.SAMPLE,
+    reruns: Path | None = None,
+    ledger: Path | None = None,
+    draft: bool = False,
     say: Callable[[str], None] = lambda line: None,
 ) -> tuple[Path, Path]:
-    """Writes ``LEADERBOARD.md`` and ``leaderboard.html``, and what a rebuild needs beside them.
+    """Writes ``LEADERBOARD.md`` and ``leaderboard.html``, and the clips beside them.
 
     Args:
         results_folder: Holds ``<policy>/<task>.json``.
         out: Folder to write to; made if missing.
-        replay: Scenarios of each new result to play again, drawn by the file's hash; a number that
-            a result does not have plays all of it.
+        replay: Scenarios of each new result to play again, drawn anew; a number that a result does
+            not have plays all of it.
+        reruns: Folder of the maintainers' own results on an unseen split, laid out likewise; see
+            `board_reruns`.
+        ledger: Where this machine remembers what it played; `board_replays.own_ledger` by default.
+        draft: Show what is no score yet, and say so on the board; see `submission.check`.
         say: Told what takes time.
 
     Returns:
@@ -47,47 +53,26 @@ def build(
 
     Raises:
         ResultError: A result is refused, or there is none; the board stays as it was.
-        OptionError: `replay` is below 1.
+        OptionError: `replay` is below 1, or the ledger lies among the results.
         OutputError: A file cannot be written.
         RenderError: A clip is to be drawn and nothing here can.
     """
-    submissions = collect(results_folder)
+    ledger = board_replays.own_ledger() if ledger is None else ledger
+    if ledger.resolve().is_relative_to(results_folder.resolve()):
+        raise OptionError(f"{ledger} lies among the results; what was played is noted elsewhere")
+    submissions = submission.check(results_folder, draft=draft)
     written = out / "LEADERBOARD.md", out / "leaderboard.html"
     for path in written:
         files.check_writable(path)
-    ledger = out / board_replays.LEDGER
     replays = board_replays.check(submissions, ledger, sample=replay, say=say)
-    entries = make_entries(submissions, replays)
+    rerun = {} if reruns is None else board_reruns.check(submissions, reruns)
+    entries = make_entries(submissions, replays, rerun)
     clips = board_clips.clips(submissions, out / board_clips.FOLDER, say)
-    board_replays.write(ledger, replays)
-    for path, text in zip(written, (markdown(entries), page(entries, clips)), strict=True):
+    texts = markdown(entries, draft=draft), page(entries, clips, draft=draft)
+    for path, text in zip(written, texts, strict=True):
         with files.replacing(path) as temporary:
             temporary.write_text(text, encoding="utf-8", newline="\n")
     return written
-
-
-def collect(results_folder: Path) -> list[Submission]:
-    """Reads every result of a folder and refuses what does not belong on one board.
-
-    Raises:
-        ResultError: Names the file and the reason.
-        UnknownTaskError: A result names a task that does not exist.
-    """
-    paths = sorted(results_folder.rglob("*.json"))
-    if not paths:
-        raise ResultError(
-            f"there are no results below {results_folder}; make one with 'hvs evaluate ... --out "
-            f"{results_folder}/<policy>/<task>.json'"
-        )
-    found: list[Submission] = []
-    for path in paths:
-        entry = Submission(path, result_file.load(path))
-        submission.check_place(entry, results_folder)
-        check_task(path, entry.result)
-        for earlier in found:
-            submission.check_pair(entry, earlier)
-        found.append(entry)
-    return found
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -108,18 +93,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
         default=board_replays.SAMPLE,
         help="scenarios of each new result to play again; 1000 plays all (default: %(default)s)",
     )
+    parser.add_argument("--reruns", type=Path, help="folder of the maintainers' own re-runs")
+    parser.add_argument(
+        "--ledger", type=Path, help="where to remember what was played (default: the user's cache)"
+    )
+    parser.add_argument("--draft", action="store_true", help="show what is no score yet")
     options = parser.parse_args(arguments)
     try:
-        for path in build(options.results, options.out, replay=options.replay, say=_say):
+        for path in build(
+            options.results,
+            options.out,
+            replay=options.replay,
+            reruns=options.reruns,
+            ledger=options.ledger,
+            draft=options.draft,
+            say=_say,
+        ):
             print(path)
     except HvsError as error:
-        print(f"leaderboard: {error}", file=sys.stderr)
+        _say(str(error))
         return 2
     return 0
 
 
 def _say(line: str) -> None:
-    print(f"leaderboard: {line}", file=sys.stderr)
+    print(f"leaderboard: {shown(line)}", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -12,8 +12,9 @@ from typing import Annotated, Any, Literal, Self
 
 import pydantic
 
-from hvs_suite import files, registry, statistics
+from hvs_suite import files, reading, registry, statistics
 from hvs_suite.errors import ResultError
+from hvs_suite.eval.result_file import MOST_BYTES
 from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
 
 LEROBOT_SEED = 1000
@@ -121,12 +122,10 @@ def read(
         UnknownTaskError: There is no such task.
     """
     registry.find(task)
+    content = reading.read_json(path, error=ResultError, most=MOST_BYTES)
     try:
-        content = json.loads(path.read_bytes())
         successes, sums, largest, claimed = _lists(content)
-    except OSError as error:
-        raise ResultError(f"{path}: cannot be read ({error.strerror})") from error
-    except (ValueError, KeyError, TypeError, IndexError) as error:
+    except (ValueError, KeyError, TypeError, IndexError, OverflowError) as error:
         raise ResultError(
             f"{path}: is no eval_info.json of one task, as lerobot-eval writes it ({error!r})"
         ) from error
@@ -136,9 +135,9 @@ def read(
     rows = [
         ImportedRow(
             scenario=(seed + i) % count,
-            success=bool(success),
-            sum_reward=float(sums[i]),
-            max_reward=float(largest[i]),
+            success=success,
+            sum_reward=sums[i],
+            max_reward=largest[i],
         )
         for i, success in enumerate(successes)
     ]
@@ -168,14 +167,8 @@ def load(path: Path) -> ImportedResult:
     Raises:
         ResultError: The file cannot be read or is none.
     """
-    try:
-        return ImportedResult.model_validate_json(path.read_bytes())
-    except OSError as error:
-        raise ResultError(f"{path}: cannot be read ({error.strerror})") from error
-    except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise ResultError(f"{path}: {where}: {first['msg']}; import it again") from error
+    content = reading.read_json(path, error=ResultError, most=MOST_BYTES)
+    return reading.validated(ImportedResult, content, path, error=ResultError)
 
 
 def is_imported(content: Any) -> bool:
@@ -183,21 +176,24 @@ def is_imported(content: Any) -> bool:
     return isinstance(content, dict) and content.get("origin") == "lerobot-eval"
 
 
-def _lists(content: Mapping[str, Any]) -> tuple[list[Any], list[Any], list[Any], float]:
+def _lists(content: Mapping[str, Any]) -> tuple[list[bool], list[float], list[float], float]:
     """Successes, sums and maxima of rewards, and the success rate claimed (percent)."""
     if "per_episode" in content:
         rows = content["per_episode"]
-        return (
-            [row["success"] for row in rows],
-            [row["sum_reward"] for row in rows],
-            [row["max_reward"] for row in rows],
-            float(content["aggregated"]["pc_success"]),
+        successes, sums, largest = (
+            [row[name] for row in rows] for name in ("success", "sum_reward", "max_reward")
         )
-    (task,) = content["per_task"]
-    metrics = task["metrics"]
+        claimed = content["aggregated"]["pc_success"]
+    else:
+        (task,) = content["per_task"]
+        metrics = task["metrics"]
+        successes, sums, largest = (
+            metrics[name] for name in ("successes", "sum_rewards", "max_rewards")
+        )
+        claimed = content["overall"]["pc_success"]
     return (
-        metrics["successes"],
-        metrics["sum_rewards"],
-        metrics["max_rewards"],
-        float(content["overall"]["pc_success"]),
+        [bool(success) for success in successes],
+        [float(reward) for reward in sums],
+        [float(reward) for reward in largest],
+        float(claimed),
     )

@@ -157,7 +157,6 @@ class ProgressFile:
                 slowest_s=float(kept["slowest_s"]),
                 play_s=float(kept["play_s"]),
                 detail="",
-                nearness=float("inf"),
             )
             self.elapsed_s = max(self.elapsed_s, float(kept["elapsed_s"]))
         except (ValueError, KeyError, TypeError, binascii.Error, pydantic.ValidationError) as error:

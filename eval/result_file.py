@@ -16,7 +16,7 @@ from typing import Annotated, Any, Final, Literal, Self
 
 import pydantic
 
-from hvs_suite import files, statistics
+from hvs_suite import files, reading, statistics
 from hvs_suite.errors import ResultError
 
 SCHEMA_VERSION: Final = 2
@@ -24,6 +24,8 @@ ERRORS = ("position_error_mm", "lateral_error_mm", "height_error_mm", "tilt_erro
 SCALES = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 20.0, 50.0, 100.0)
 """Where the curve of success against tolerance is given, in multiples of the task's tolerances."""
 SHARPEST_PERCENT = 95.0
+MOST_BYTES = 16 * 2**20
+"""Largest file that is read: twenty-five times one of 1,000 scenarios."""
 
 Count = Annotated[int, pydantic.Field(ge=0)]
 Error = Annotated[float, pydantic.Field(ge=0.0, allow_inf_nan=False)]
@@ -481,29 +483,20 @@ def load(path: Path) -> Result:
     Raises:
         ResultError: The file cannot be read, or is not a consistent result; says what is wrong.
     """
-    try:
-        content = json.loads(path.read_bytes())
-    except OSError as error:
-        raise ResultError(f"{path}: cannot be read ({error.strerror})") from error
-    except ValueError as error:
-        raise ResultError(f"{path}: is not JSON ({error}); evaluate again") from error
-    version = content.get("schema_version") if isinstance(content, dict) else None
+    content = reading.read_object(path, error=ResultError, most=MOST_BYTES)
+    version = content.get("schema_version")
     if version != SCHEMA_VERSION:
         raise ResultError(
-            f"{path}: schema_version is {version!r}, but this hvs_suite reads {SCHEMA_VERSION}; "
-            "evaluate again with this version"
+            f"{path}: schema_version is {version!r:.50}, but this hvs_suite reads "
+            f"{SCHEMA_VERSION}; evaluate again with this version"
         )
     sealed = content.pop("sha256", None)
+    result = reading.validated(Result, content, path, error=ResultError)
     try:
-        result = Result.model_validate(content)
-    except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        what = first["msg"].removeprefix("Value error, ")
-        raise ResultError(
-            f"{path}: {where + ': ' if where else ''}{what}; evaluate again"
-        ) from error
-    if sealed != seal(content):
+        fits = sealed == seal(content)
+    except ValueError as error:
+        raise ResultError(f"{path}: holds a number without bounds; evaluate again") from error
+    if not fits:
         raise ResultError(f"{path}: was changed after it was written (sha256); evaluate again")
     return result
 

@@ -115,8 +115,6 @@ class Trial:
         slowest_s: Its longest decision (s).
         play_s: Wall time of the whole trial in the process that played it, reset included (s).
         detail: What the policy said when it failed; empty if it did not.
-        nearness: Least distance of an error to its tolerance at the end of any control step, in
-            units of `NEAR_MM` and `NEAR_DEG`: below 1, rounding may have decided the outcome.
     """
 
     row: EpisodeRow
@@ -125,7 +123,131 @@ class Trial:
     slowest_s: float
     play_s: float
     detail: str
-    nearness: float
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Course:
+    """How a scenario went, step by step: all that its row is made of.
+
+    Attributes:
+        scenario: Index in the split.
+        hold_steps: Consecutive control steps inside the tolerances that make a success.
+        actions: (n, 7) float32, as the policy gave them, before clipping.
+        inside: (n,) whether the task took the flange to be inside the tolerances.
+        excess: (n,) largest excess of an error over its bound, in units of `NEAR_MM` and
+            `NEAR_DEG`: inside below 0, outside above, and between -1 and 1 rounding may decide. A
+            collision is outside by infinity.
+        clipped: (n,) whether the action was out of range.
+        errors: Errors (mm, deg) after the reset and after each step, n + 1 of them.
+        collision: A forbidden contact ended it.
+        truncated: The time limit did.
+        failure: Why the policy lost it; None if it did not.
+        landing_mm: (2,) where the flange stood over the target at the end (mm).
+    """
+
+    scenario: int
+    hold_steps: int
+    actions: npt.NDArray[np.float32]
+    inside: npt.NDArray[np.bool_]
+    excess: npt.NDArray[np.float64]
+    clipped: npt.NDArray[np.bool_]
+    errors: Sequence[Mapping[str, float]]
+    collision: bool
+    truncated: bool
+    failure: str | None
+    landing_mm: npt.NDArray[np.float64]
+
+    def row(self, inside: npt.NDArray[np.bool_] | None = None) -> EpisodeRow:
+        """Returns the row that this course makes.
+
+        Args:
+            inside: (n,) verdicts on each step to go by; those of the task by default.
+        """
+        inside = self.inside if inside is None else inside
+        n = len(self.actions)
+        goal = self._goal(inside)
+        steps = n if goal is None else goal
+        settled = {f"settled_{name}": value for name, value in self.errors[n].items()}
+        x, y = self.landing_mm
+        return EpisodeRow(
+            scenario=self.scenario,
+            success=goal is not None,
+            success_once=bool(inside[:steps].any()),
+            collision=goal is None and self.collision,
+            truncated=goal is None and self.truncated,
+            steps=steps,
+            steps_to_goal=goal,
+            n_clipped=int(self.clipped[:steps].sum()),
+            **self.errors[steps],
+            failure=self.failure if goal is None else None,
+            settled_steps=n,
+            settled_collision=self.collision,
+            settled_failure=self.failure,
+            **settled,
+            settled_x_mm=round(float(x), _DIGITS),
+            settled_y_mm=round(float(y), _DIGITS),
+        )
+
+    def could_be(self, claimed: EpisodeRow) -> EpisodeRow:
+        """Returns the row of this course that comes closest to a claimed one.
+
+        Only verdicts within a rounding of a bound may be turned, and only to the claimed outcome.
+
+        Args:
+            claimed: A row of this scenario.
+
+        Returns:
+            A row with the claimed outcome if rounding can have decided it; else that of `row`.
+        """
+        surely = self.inside & (self.excess < -1.0)
+        near = np.flatnonzero(np.abs(self.excess) <= 1.0)
+        # Without a turned verdict too many, so that none makes a success before the claimed one.
+        turned: list[npt.NDArray[np.intp]] = [near[:0]]
+        if claimed.success:
+            held = range(claimed.steps - self.hold_steps, claimed.steps)
+            turned = [near[np.isin(near, held)]]
+        elif claimed.success_once:
+            turned += [near[k : k + 1] for k in range(len(near))]
+        found = self.row()
+        if same_outcome(found, claimed):
+            return found
+        for steps in turned:
+            inside = surely.copy()
+            inside[steps] = True
+            other = self.row(inside)
+            if same_outcome(other, claimed):
+                return other
+        return found
+
+    def _goal(self, inside: npt.NDArray[np.bool_]) -> int | None:
+        """Returns after how many steps the goal had been held; None if it never was."""
+        held = 0
+        for step, is_inside in enumerate(inside.tolist(), 1):
+            held = held + 1 if is_inside else 0
+            if held >= self.hold_steps:
+                return step
+        return None
+
+
+OUTCOME = (
+    "success",
+    "success_once",
+    "collision",
+    "truncated",
+    "steps",
+    "steps_to_goal",
+    "n_clipped",
+    "failure",
+    "settled_steps",
+    "settled_collision",
+    "settled_failure",
+)
+"""What a row says of an episode apart from its errors."""
+
+
+def same_outcome(one: EpisodeRow, other: EpisodeRow) -> bool:
+    """Whether two rows differ in nothing but their errors."""
+    return all(getattr(one, name) == getattr(other, name) for name in OUTCOME)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -148,9 +270,7 @@ class PlayTrial:
         return _play_policy(env, policy, scenario, seed, self.decision_limit_s)
 
 
-def play_trial(
-    env: Stage, start: Callable[[], None], decide: Decide, scenario: int
-) -> tuple[EpisodeRow, npt.NDArray[np.float32], float]:
+def play_trial(env: Stage, start: Callable[[], None], decide: Decide, scenario: int) -> Course:
     """Plays one scenario with a function of the observation.
 
     Args:
@@ -161,52 +281,41 @@ def play_trial(
         scenario: Index in the environment's split.
 
     Returns:
-        Row, actions (n, 7) float32 before clipping, and nearness as in `Trial`.
+        How it went.
     """
     env.goal_ends_episode = False
     spec = env.action_spec()
     low, high = np.float32(spec.minimum), np.float32(spec.maximum)
-    bounds = _near_bounds(env.variant)
     time_step = env.reset(scenario=scenario)
     actions: list[Action] = []
-    n_clipped = 0
-    nearness = np.inf
-    once = False
-    scored: dict[str, Any] | None = None
+    clipped: list[bool] = []
+    infos = [env.info]
     failure: str | None = None
-    info = env.info
     try:
         start()
         while not time_step.last():
             action = decide(time_step.observation)
             # Both are float32, and np.clip takes three times as long.
             executed = np.minimum(np.maximum(action, low), high)
-            n_clipped += bool((executed != action).any())
             time_step = env.step(executed)
+            clipped.append(bool((executed != action).any()))
             actions.append(action)
-            info = env.info
-            nearness = min(nearness, _nearness(info, bounds))
-            if scored is None:
-                once = bool(info["success_once"])
-                if info["is_success"]:
-                    scored = _outcome(info, len(actions), n_clipped, once, None)
+            infos.append(env.info)
     except EpisodeLostError as error:
         failure = error.reason
-    if scored is None:
-        scored = _outcome(info, len(actions), n_clipped, once, failure)
-    x, y = env.landing_mm
-    settled: dict[str, Any] = {f"settled_{name}": value for name, value in _errors(info).items()}
-    row = EpisodeRow(
+    return Course(
         scenario=int(scenario),
-        **scored,
-        settled_steps=len(actions),
-        settled_collision=bool(info["collision"]),
-        settled_failure=failure,
-        **settled,
-        settled_x_mm=round(float(x), _DIGITS),
-        settled_y_mm=round(float(y), _DIGITS),
+        hold_steps=env.variant.hold_steps,
+        actions=np.array(actions, np.float32).reshape(-1, *spec.shape),
+        inside=np.array([info["n_inside"] > 0 for info in infos[1:]], np.bool_),
+        excess=np.array([_excess(info, env.variant.tolerances) for info in infos[1:]], np.float64),
+        clipped=np.array(clipped, np.bool_),
+        errors=[_errors(info) for info in infos],
+        collision=bool(infos[-1]["collision"]),
+        truncated=bool(infos[-1]["truncated"]),
+        failure=failure,
+        landing_mm=np.array(env.landing_mm),
     )
-    return row, np.array(actions, np.float32).reshape(-1, *spec.shape), nearness
 
 
 def _play_policy(env: Stage, policy: Policy, scenario: int, seed: int, limit_s: float) -> Trial:
@@ -257,15 +366,14 @@ def _play_policy(env: Stage, policy: Policy, scenario: int, seed: int, limit_s: 
         guarded(policy.reset)
 
     with contextlib.ExitStack() as seeds, _alarm_clock() as set_alarm:
-        row, actions, nearness = play_trial(env, start, decide, scenario)
+        course = play_trial(env, start, decide, scenario)
     return Trial(
-        row=row,
-        actions=actions,
+        row=course.row(),
+        actions=course.actions,
         decision_s=sum(times),
         slowest_s=max(times),
         play_s=time.perf_counter() - begun,
         detail=detail,
-        nearness=nearness,
     )
 
 
@@ -345,35 +453,15 @@ def _alarm_clock() -> Iterator[Callable[[float], object]]:
             signal.setitimer(signal.ITIMER_REAL, left)
 
 
-def _outcome(
-    info: Mapping[str, Any], steps: int, n_clipped: int, once: bool, failure: str | None
-) -> dict[str, Any]:
-    """The scored part of a row."""
-    success = bool(info["is_success"]) and failure is None
-    return {
-        "success": success,
-        "success_once": once,
-        "collision": bool(info["collision"]),
-        "truncated": bool(info["truncated"]) and not success,
-        "steps": steps,
-        "steps_to_goal": steps if success else None,
-        "n_clipped": n_clipped,
-        **_errors(info),
-        "failure": failure,
-    }
-
-
 def _errors(info: Mapping[str, Any]) -> dict[str, float]:
     return {name: round(float(info[name]), _DIGITS) for name in ERRORS}
 
 
-def _near_bounds(variant: Any) -> list[tuple[str, float, float]]:
-    """Name, bound and unit of nearness of each bounded error."""
-    return [
-        (name, bound, NEAR_DEG if name.endswith("deg") else NEAR_MM)
-        for name, bound in variant.tolerances.items()
-    ]
-
-
-def _nearness(info: Mapping[str, Any], bounds: Sequence[tuple[str, float, float]]) -> float:
-    return min(abs(float(info[name]) - bound) / unit for name, bound, unit in bounds)
+def _excess(info: Mapping[str, Any], tolerances: Mapping[str, float]) -> float:
+    """Largest excess of an error over its bound, as in `Course`."""
+    if info["collision"]:
+        return np.inf
+    return max(
+        (float(info[name]) - bound) / (NEAR_DEG if name.endswith("deg") else NEAR_MM)
+        for name, bound in tolerances.items()
+    )

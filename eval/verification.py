@@ -9,7 +9,8 @@ import contextlib
 import dataclasses
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import secrets
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,28 +24,20 @@ from hvs_suite.eval.result_file import EpisodeRow, Result
 from hvs_suite.eval.trial import (
     NEAR_DEG,
     NEAR_MM,
+    OUTCOME,
     EpisodeLostError,
     Stage,
     play_trial,
+    same_outcome,
 )
 from hvs_suite.policies import builtin
 from hvs_suite.rollout import Action, Observation
 from hvs_suite.tasks.shared import lock
 
 LOG_ENDS = "the action log ends"
-_OUTCOME = (
-    "success",
-    "success_once",
-    "collision",
-    "truncated",
-    "steps",
-    "steps_to_goal",
-    "n_clipped",
-    "failure",
-    "settled_steps",
-    "settled_collision",
-    "settled_failure",
-)
+MOST_NEAR_PER_MILLE = 5
+"""Outcomes of a thousand that rounding may decide, at least one: far more than chance brings, and
+too few to lift a score."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +47,8 @@ class Verdict:
     Attributes:
         n_episodes: Scenarios of the result.
         n_played: Those that were played again.
-        n_near: Those of them whose outcome differs, a rounding away from a tolerance.
+        n_near: Those of them whose outcome rounding decided, at a bound on an error.
+        nonce: What a sample was drawn with; None where all were played.
         largest_mm: Largest difference of a position error (mm).
         largest_deg: Largest difference of a tilt error (deg).
     """
@@ -62,6 +56,7 @@ class Verdict:
     n_episodes: int
     n_played: int
     n_near: int
+    nonce: str | None
     largest_mm: float
     largest_deg: float
 
@@ -72,32 +67,38 @@ class ReplayTrial:
 
     Attributes:
         actions: (steps, 7) of each scenario.
-        failures: Why the policy had no further action, by scenario; None where it had.
+        claimed: What the result says of each; why its policy had no further action is believed.
     """
 
     actions: Mapping[int, Action]
-    failures: Mapping[int, str | None]
+    claimed: Mapping[int, EpisodeRow]
 
     def __call__(
         self, env: Stage, policy: rollout.Policy, scenario: int
-    ) -> tuple[EpisodeRow, float]:
-        """Returns the row that the actions give, and its nearness as in `Trial`."""
+    ) -> tuple[EpisodeRow, bool]:
+        """Returns the row that the actions give, and whether rounding decided its outcome.
+
+        Where rounding can have decided it as claimed, it is taken to have done so.
+        """
+        claimed = self.claimed[scenario]
         remaining = iter(self.actions[scenario])
 
         def decide(observation: Observation) -> Action:
             action = next(remaining, None)
             if action is None:
-                raise EpisodeLostError(self.failures[scenario] or LOG_ENDS)
+                raise EpisodeLostError(claimed.settled_failure or LOG_ENDS)
             return action
 
-        row, _, nearness = play_trial(env, lambda: None, decide, scenario)
-        return row, nearness
+        course = play_trial(env, lambda: None, decide, scenario)
+        found = course.could_be(claimed)
+        return found, not same_outcome(found, course.row())
 
 
 def verify(
     path: Path,
     *,
     sample: int | None = None,
+    nonce: str | None = None,
     workers: int = 1,
     progress: Callable[[], None] | None = None,
 ) -> Verdict:
@@ -105,7 +106,9 @@ def verify(
 
     Args:
         path: The result; its action log stands beside it.
-        sample: Scenarios to play again, drawn by the file's own hash; None plays all.
+        sample: Scenarios to play again; None plays all.
+        nonce: What the sample is drawn with, to repeat a draw; a new one by default, since whoever
+            made the file must not know it.
         workers: Processes that share the work.
         progress: Called after each scenario.
 
@@ -121,33 +124,33 @@ def verify(
         raise OptionError(f"a sample holds at least 1 scenario, not {sample}")
     result = result_file.load(path)
     check_task(path, result)
-    log = action_log.load(result_file.actions_path(path), result.metadata.actions_sha256)
-    rows = result.episodes
-    if len(log) != len(rows):
-        raise ResultError(
-            f"{path}: the action log holds {len(log)} scenarios, the result {len(rows)}"
-        )
-    for row, actions in zip(rows, log, strict=True):
-        if len(actions) != row.settled_steps:
-            raise ResultError(
-                f"{path}: scenario {row.scenario}: settled_steps is {row.settled_steps}, but "
-                f"{len(actions)} actions are logged"
-            )
-    chosen = drawn(path, len(rows), sample)
+    log, rows = load_actions(path, result), result.episodes
+    if sample is None or sample >= len(rows):
+        chosen, nonce = list(range(len(rows))), None
+    else:
+        nonce = new_nonce() if nonce is None else nonce
+        chosen = drawn(len(rows), sample, nonce)
     replay = ReplayTrial(
         {index: log[index] for index in chosen},
-        {index: rows[index].settled_failure for index in chosen},
+        {index: rows[index] for index in chosen},
     )
     task = MakeTask(result.summary.task, result.summary.split, pictures=False)
     n_near, largest = 0, {"mm": 0.0, "deg": 0.0}
     with contextlib.closing(
         rollout.play(task, builtin.make_zero, chosen, replay, workers=workers)
     ) as played:
-        for row, nearness in played:
-            n_near += _compare(path, rows[row.scenario], row, nearness, largest)
+        for row, by_rounding in played:
+            _compare(path, rows[row.scenario], row, largest)
+            n_near += by_rounding
             if progress is not None:
                 progress()
-    return Verdict(len(rows), len(chosen), n_near, largest["mm"], largest["deg"])
+    most = max(1, MOST_NEAR_PER_MILLE * len(chosen) // 1000)
+    if n_near > most:
+        raise ResultError(
+            f"{path}: rounding would have decided {n_near} of {len(chosen)} outcomes as the file "
+            f"says; more than {most} is no chance"
+        )
+    return Verdict(len(rows), len(chosen), n_near, nonce, largest["mm"], largest["deg"])
 
 
 def check_task(path: Path, result: Result) -> None:
@@ -177,37 +180,66 @@ def check_task(path: Path, result: Result) -> None:
             )
 
 
-def drawn(path: Path, n: int, sample: int | None) -> list[int]:
-    """Returns the scenarios to play again: all of 0..n-1, or a sample drawn by the file's hash."""
-    if sample is None or sample >= n:
-        return list(range(n))
-    key = int.from_bytes(hashlib.sha256(path.read_bytes()).digest()[:16], "little")
+def load_actions(path: Path, result: Result) -> list[action_log.Actions]:
+    """Reads the action log of a result.
+
+    Args:
+        path: The result's file.
+        result: What it holds.
+
+    Returns:
+        (steps, 7) float32 of each of its rows.
+
+    Raises:
+        ResultError: The log cannot be read, is another one, or is not as long as the rows say.
+    """
+    log = action_log.load(result_file.actions_path(path), result.metadata.actions_sha256)
+    rows = result.episodes
+    if len(log) != len(rows):
+        raise ResultError(
+            f"{path}: the action log holds {len(log)} scenarios, the result {len(rows)}"
+        )
+    for row, actions in zip(rows, log, strict=True):
+        if len(actions) != row.settled_steps:
+            raise ResultError(
+                f"{path}: scenario {row.scenario}: settled_steps is {row.settled_steps}, but "
+                f"{len(actions)} actions are logged"
+            )
+        if len(actions) > result.metadata.time_limit_steps:
+            raise ResultError(
+                f"{path}: scenario {row.scenario}: {len(actions)} actions are logged, more than "
+                f"the time limit of {result.metadata.time_limit_steps} steps"
+            )
+    return log
+
+
+def new_nonce() -> str:
+    """Returns what a sample can be drawn with and nobody could know before: 32 hex digits."""
+    return secrets.token_hex(16)
+
+
+def drawn(n: int, sample: int, nonce: str) -> list[int]:
+    """Returns which of the scenarios 0..n-1 a nonce draws, `sample` of them in order."""
+    key = int.from_bytes(hashlib.sha256(nonce.encode()).digest()[:16], "little")
     random = np.random.Generator(np.random.Philox(key=key))
     return sorted(random.choice(n, size=sample, replace=False).tolist())
 
 
-def _compare(
-    path: Path, said: EpisodeRow, found: EpisodeRow, nearness: float, largest: dict[str, float]
-) -> bool:
-    """Compares a row with the one played again; returns whether rounding decided its outcome.
+def _compare(path: Path, said: EpisodeRow, found: EpisodeRow, largest: dict[str, float]) -> None:
+    """Compares a row with the one played again; keeps the largest differences of errors.
 
     Raises:
-        ResultError: They differ by more than that.
+        ResultError: They differ.
     """
     where = f"{path}: scenario {said.scenario}"
-    differs = [name for name in _OUTCOME if getattr(said, name) != getattr(found, name)]
-    if differs and nearness > 1.0:
-        name = differs[0]
-        raise ResultError(
-            f"{where}: {name} is {getattr(said, name)}, but the logged actions give "
-            f"{getattr(found, name)}"
-        )
-    errors: Iterable[str] = [*(f"settled_{name}" for name in result_file.ERRORS)]
-    errors = [*errors, "settled_x_mm", "settled_y_mm"]
-    if not differs:
-        # Another end of the episode has other errors, and rightly so.
-        errors = [*result_file.ERRORS, *errors]
-    for name in errors:
+    for name in OUTCOME:
+        if getattr(said, name) != getattr(found, name):
+            raise ResultError(
+                f"{where}: {name} is {getattr(said, name)}, but the logged actions give "
+                f"{getattr(found, name)}"
+            )
+    settled = [f"settled_{name}" for name in (*result_file.ERRORS, "x_mm", "y_mm")]
+    for name in (*result_file.ERRORS, *settled):
         unit, bound = ("deg", NEAR_DEG) if name.endswith("deg") else ("mm", NEAR_MM)
         ours, theirs = getattr(said, name), getattr(found, name)
         largest[unit] = max(largest[unit], abs(ours - theirs))
@@ -216,7 +248,6 @@ def _compare(
             raise ResultError(
                 f"{where}: {name} is {ours}, but the logged actions give {theirs} {unit}"
             )
-    return bool(differs)
 
 
 def results_in(paths: Sequence[Path]) -> list[Path]:

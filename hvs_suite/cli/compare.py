@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from hvs_suite.cli import console
+from hvs_suite.names import shown
 
 if TYPE_CHECKING:
     from hvs_suite.statistics import Difference
@@ -49,7 +50,7 @@ class Compare:
             ],
             title=f"A = {found.a}, B = {found.b}; differences are A minus B with 95 % intervals",
         )
-        print(found.conclusion())
+        print(shown(found.conclusion()))
         return 0
 
 

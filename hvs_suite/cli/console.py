@@ -12,6 +12,8 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from hvs_suite.names import shown
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -42,13 +44,20 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], title: st
     """
     from rich import box
     from rich.table import Table
+    from rich.text import Text
 
-    table = Table(title=title or None, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False)
+    # As text, not as markup: cells and titles hold names that strangers gave.
+    table = Table(
+        title=Text(shown(title)) if title else None,
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+    )
     for index, column in enumerate(columns):
         figures = all(FIGURE.fullmatch(row[index]) for row in rows)
         table.add_column(column, justify="right" if figures else "left")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*(Text(shown(cell)) for cell in row))
     console().print(table)
 
 
@@ -63,12 +72,13 @@ def progress(what: str, total: int) -> Iterator[Callable[..., None]]:
     Yields:
         A function to call after each unit, if need be with a few words on how it goes.
     """
+    what = shown(what)
     if sys.stderr.isatty():
         from rich import progress as rich_progress
         from rich.console import Console
 
         bar = rich_progress.Progress(
-            rich_progress.TextColumn("{task.description}"),
+            rich_progress.TextColumn("{task.description}", markup=False),
             rich_progress.BarColumn(),
             rich_progress.MofNCompleteColumn(),
             rich_progress.TimeRemainingColumn(),

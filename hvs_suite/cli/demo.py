@@ -77,7 +77,7 @@ class Demo:
                 out=result,
             ).run()
         with console.stage("build the board", times_s):
-            Leaderboard(results=results, out=board).run()
+            Leaderboard(results=results, out=board, ledger=board / "replays.json", draft=True).run()
         with console.stage("film an episode", times_s):
             film_one(policy, self.task, _solved_scenario(result), film)
 

@@ -6,6 +6,8 @@ from typing import Annotated
 
 import tyro
 
+from hvs_suite.names import shown
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ImportLerobot:
@@ -38,7 +40,7 @@ class ImportLerobot:
         summary = result.summary
         low, high = summary.pc_success_ci95
         print(
-            f"{summary.policy} on {summary.task}, unverified: {summary.n_success} of "
+            f"{shown(summary.policy)} on {summary.task}, unverified: {summary.n_success} of "
             f"{summary.n_episodes} ({low:.1f} to {high:.1f} %)"
         )
         print(f"Written to {self.out}")

@@ -8,6 +8,7 @@ import tyro
 
 from hvs_suite.cli import console
 from hvs_suite.errors import ResultError, UnknownTaskError
+from hvs_suite.names import shown
 
 BROKEN = 1
 
@@ -20,7 +21,8 @@ class Verify:
 
     Attributes:
         files: Result files, or folders of them.
-        sample: Scenarios of each file to play again, drawn by its hash; all by default.
+        sample: Scenarios of each file to play again, drawn with a new nonce; all by default.
+        nonce: What to draw the sample with, to repeat a draw that was printed.
         submission: Also hold the files against the rules of the board (eval/SUBMITTING.md).
         results: With --submission, the folder that holds <policy>/<task>.json.
         workers: Processes that share the work.
@@ -29,6 +31,7 @@ class Verify:
 
     files: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="FILE")]
     sample: int | None = None
+    nonce: str | None = None
     submission: bool = False
     results: Path = Path("eval/results")
     workers: int = 1
@@ -42,20 +45,25 @@ class Verify:
         found = []
         try:
             if self.submission:
-                submission.check(paths, self.results)
+                submission.check(self.results, paths)
             for path in paths:
                 n = result_file.load(path).summary.n_episodes
                 n = n if self.sample is None else min(n, self.sample)
                 with console.progress(f"verify {path}", n) as advance:
                     verdict = verification.verify(
-                        path, sample=self.sample, workers=self.workers, progress=advance
+                        path,
+                        sample=self.sample,
+                        nonce=self.nonce,
+                        workers=self.workers,
+                        progress=advance,
                     )
                 found.append(verification.as_json(path, verdict))
                 if not self.json:
-                    near = f", {verdict.n_near} decided by rounding" if verdict.n_near else ""
+                    drawn = "" if verdict.nonce is None else f" (nonce {verdict.nonce})"
                     print(
-                        f"{path}: as it says; {verdict.n_played} of {verdict.n_episodes} scenarios "
-                        f"played again{near}, largest difference {verdict.largest_mm:.1e} mm and "
+                        f"{shown(str(path))}: as it says; {verdict.n_played} of "
+                        f"{verdict.n_episodes} scenarios played again{drawn}, {verdict.n_near} "
+                        f"decided by rounding, largest difference {verdict.largest_mm:.1e} mm and "
                         f"{verdict.largest_deg:.1e} deg"
                     )
         except (ResultError, UnknownTaskError) as error:

@@ -145,7 +145,10 @@ def test_the_older_layout_of_the_file_is_read_too(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        ("[1", "is no eval_info.json"),
+        ("[1", "is not JSON"),
+        ("[1]", "is no eval_info.json"),
+        ('{"per_task": 3}', "is no eval_info.json"),
+        (json.dumps(eval_info([True, False]) | {"overall": None}), "is no eval_info.json"),
         ("{}", "is no eval_info.json"),
         (json.dumps(eval_info([True, False], claimed=100.0)), "pc_success is 100"),
         (json.dumps(eval_info([True] * 1001)), "a scenario twice"),

@@ -2,6 +2,7 @@
 
 import html.parser
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -22,12 +23,15 @@ from hvs_suite.eval import (
     leaderboard,
     protocol,
     result_file,
+    submission,
+    verification,
 )
 from hvs_suite.eval.board_page import page
 from hvs_suite.eval.board_tables import Entry
 
 ROOT = Path(__file__).parents[2]
 COMMITTED = ROOT / "eval"
+BOARD = ("LEADERBOARD.md", "leaderboard.html")
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +45,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ):
         path = folder / "results" / policy / f"{task}.json"
         protocol.evaluate(policy, task, path, episodes=n)
-    leaderboard.build(folder / "results", folder / "out", replay=1)
+    build(folder, replay=1)
     return folder
 
 
@@ -53,6 +57,9 @@ def folder(made: Path, tmp_path: Path) -> Path:
 
 
 def build(folder: Path, **options: Any) -> tuple[Path, Path]:
+    """A draft, since these results are too short for a score."""
+    ledger = folder / "cache" / "replays.json"
+    options = {"draft": True, "ledger": ledger} | options
     return leaderboard.build(folder / "results", folder / "out", **options)
 
 
@@ -87,7 +94,7 @@ def test_markdown_holds_a_row_for_each_result_best_first(made: Path) -> None:
         "| zero",
     ]
     assert "| expert | 100 % (43.9–100.0 %) | 0 % |" in fixed
-    assert fixed.count("| 1 of 3 |") == 2
+    assert fixed.count("| replayed 1 of 3 |") == 2
     # The mean's interval is narrower than either task's; who left a task out counts 0 % for it.
     assert re.search(r"\| expert \| 100 % \(5\d\.\d–100.0 %\) \| 100 % \(43\.9–100\.0 %\) \|", text)
     assert "| zero | 0 % (0.0–28.1 %) | 0 % (0.0–56.1 %) | – |" in text
@@ -135,7 +142,6 @@ def test_a_clip_that_belongs_to_no_result_is_removed(folder: Path) -> None:
     shutil.rmtree(folder / "results" / "zero")
     build(folder, replay=1)
     assert not (folder / "out" / "clips" / "zero").exists()
-    assert "zero" not in json.loads((folder / "out" / "verified.json").read_text())
 
 
 def test_more_scenarios_are_played_when_more_are_asked_for(folder: Path) -> None:
@@ -143,10 +149,8 @@ def test_more_scenarios_are_played_when_more_are_asked_for(folder: Path) -> None
     build(folder, replay=2, say=said.append)
     # Both scenarios of align-easy are played now, and two of three of the others.
     assert sum("playing 2 scenarios" in line for line in said) == 3
-    ledger = json.loads((folder / "out" / "verified.json").read_text())
-    assert ledger["expert/align-easy"]["n_played"] == 2
     text = (folder / "out" / "LEADERBOARD.md").read_text()
-    assert "| all 2 |" in text
+    assert "| replayed all 2 |" in text
     said.clear()
     build(folder, replay=1, say=said.append)
     assert said == []
@@ -271,7 +275,7 @@ def test_the_comparison_is_paired_and_corrected() -> None:
 
 
 def test_steps_are_compared_with_the_experts_on_what_both_solve(made: Path) -> None:
-    entries = board_tables.make_entries(leaderboard.collect(made / "results"))
+    entries = board_tables.make_entries(submission.check(made / "results", draft=True))
     assert [(e.policy, e.steps_over_expert) for e in entries] == [
         ("expert", 1.0),
         ("expert", 1.0),
@@ -285,6 +289,15 @@ def test_a_hostile_name_stays_text() -> None:
     assert "<img" not in page(entries)
     assert "<img" not in board_tables.markdown(entries)
     assert "(1)&#62;&#124;" in board_tables.markdown(entries)
+
+
+def test_what_is_not_seen_of_a_name_is_shown() -> None:
+    name = "a\u202eb\x1b[31m\n\ud800"
+    for text in (page([made_up(name)]), board_tables.markdown([made_up(name)])):
+        assert "\\u202eb\\x1b" in html.unescape(text)
+        assert "\u202e" not in text
+        assert "\x1b" not in text
+        assert text.encode()
 
 
 @pytest.mark.parametrize(
@@ -314,6 +327,39 @@ def flattered_summary(results: Path) -> str:
     content["summary"]["n_success"] = 3
     path.write_text(json.dumps(content))
     return r"zero/align-fixed\.json: summary\.n_success"
+
+
+def a_link(results: Path) -> str:
+    path = results / "zero" / "align-fixed.json"
+    path.rename(results.with_name("elsewhere.json"))
+    path.symlink_to(results.with_name("elsewhere.json"))
+    return r"zero/align-fixed\.json: is a symbolic link"
+
+
+def a_linked_folder(results: Path) -> str:
+    (results / "zero").rename(results.with_name("elsewhere"))
+    (results / "zero").symlink_to(results.with_name("elsewhere"))
+    return r"results/zero: is a symbolic link"
+
+
+def a_pipe(results: Path) -> str:
+    path = results / "zero" / "align-fixed.json"
+    path.unlink()
+    os.mkfifo(path)
+    return "is no regular file"
+
+
+def a_name_with_escapes(results: Path) -> str:
+    (results / "zero").rename(results / "ze\x1b[31mro")
+    return r"the folder's name .* holds U\+001B"
+
+
+def a_policy_with_line_breaks(results: Path) -> str:
+    path = results / "zero" / "align-fixed.json"
+    result = result_file.load(path)
+    summary = result.summary.model_copy(update={"policy": "zero\n| fake |"})
+    result_file.write(result.model_copy(update={"summary": summary}), path)
+    return r"summary\.policy .* holds U\+000A"
 
 
 def not_json(results: Path) -> str:
@@ -366,7 +412,7 @@ def too_high(results: Path) -> str:
 
 def no_log(results: Path) -> str:
     (results / "zero" / "align-fixed.actions.npz").unlink()
-    return "the action log cannot be read"
+    return "the action log belongs beside its result"
 
 
 def another_log(results: Path) -> str:
@@ -399,6 +445,11 @@ def flattered_row(results: Path) -> str:
     "spoil",
     [
         flattered_summary,
+        a_link,
+        a_linked_folder,
+        a_pipe,
+        a_name_with_escapes,
+        a_policy_with_line_breaks,
         not_json,
         another_version,
         another_digest,
@@ -423,28 +474,110 @@ def test_one_bad_result_stops_the_build_and_leaves_the_old_board(spoil: Any, fol
 
 
 def test_a_broken_ledger_says_so(folder: Path) -> None:
-    (folder / "out" / "verified.json").write_text('{"expert/align-easy": {"n_played": -1}}')
+    (folder / "cache" / "replays.json").write_text('{"expert/align-easy": {"n_played": -1}}')
     with pytest.raises(ResultError, match="delete it"):
         build(folder)
 
 
-def test_two_checkpoints_from_folders_of_one_name_are_no_duplicates(folder: Path) -> None:
-    shutil.copytree(folder / "results" / "zero", folder / "results" / "other")
-    path = folder / "results" / "other" / "align-fixed.json"
-    alter(path, policy_hash="b", actions_sha256=64 * "1")
-    assert len(leaderboard.collect(folder / "results")) == 4
+def test_a_ledger_does_not_lie_among_what_is_submitted(folder: Path) -> None:
+    with pytest.raises(OptionError, match="lies among the results"):
+        build(folder, ledger=folder / "results" / "zero" / "replays.txt")
+
+
+def test_what_was_played_is_remembered_by_content_not_by_name(folder: Path) -> None:
+    said: list[str] = []
+    path = folder / "results" / "zero" / "align-fixed.json"
+    (folder / "results" / "zero").rename(folder / "results" / "nothing")
+    alter(folder / "results" / "expert" / "align-fixed.json", cpu="another")
+    build(folder, replay=1, say=said.append)
+    assert [line for line in said if "playing" in line] == [said[0]]
+    assert "expert/align-fixed" in said[0]
+    assert not path.exists()
+
+
+def test_three_scenarios_are_a_draft_and_no_score(folder: Path) -> None:
+    texts = [(folder / "out" / name).read_text() for name in ("LEADERBOARD.md", "leaderboard.html")]
+    assert all("This is a draft" in text for text in texts)
+    with pytest.raises(ResultError, match="holds 2 scenarios; a score of align-easy takes 1000"):
+        build(folder, draft=False)
+
+
+@pytest.mark.parametrize("where", ["clips", "clips/x"])
+def test_nothing_is_removed_through_a_link(where: str, folder: Path) -> None:
+    elsewhere = folder / "elsewhere"
+    (elsewhere / "y").mkdir(parents=True)
+    kept = [elsewhere / "film.avif", elsewhere / "y" / "film.avif"]
+    for path in kept:
+        path.write_bytes(b"kept")
+    shutil.rmtree(folder / "out" / "clips")
+    (folder / "out" / where).parent.mkdir(exist_ok=True)
+    (folder / "out" / where).symlink_to(elsewhere)
+    with pytest.raises(OutputError, match="is a symbolic link"):
+        build(folder, replay=1)
+    assert all(path.read_bytes() == b"kept" for path in kept)
+
+
+@pytest.mark.parametrize("spoil", [os.mkfifo, lambda path: path.write_bytes(bytes(2**18 + 1))])
+def test_a_clip_that_is_no_clip_is_not_read(spoil: Any, folder: Path) -> None:
+    path = min((folder / "out" / "clips").rglob("*.avif"))
+    path.unlink()
+    spoil(path)
+    with pytest.raises(ResultError, match=r"no regular file|at most"):
+        build(folder, replay=1)
+
+
+# --- re-runs by the maintainers -------------------------------------------------------------------
+
+
+def rerun(folder: Path, policy: str, **options: Any) -> Path:
+    path = folder / "reruns" / policy / "align-fixed.json"
+    options = {"split": "unseen", "episodes": 5} | options
+    protocol.evaluate(options.pop("by", policy), "align-fixed", path, **options)
+    return path
+
+
+def test_a_rerun_on_an_unseen_split_is_another_badge(folder: Path) -> None:
+    rerun(folder, "zero")
+    build(folder, replay=1, reruns=folder / "reruns")
+    markdown, page = ((folder / "out" / name).read_text() for name in sorted(BOARD))
+    assert "| replayed 1 of 3, re-run: 0 of 5 solved |" in markdown
+    assert markdown.count("re-run: ") == 1
+    assert 'title="Re-run: the maintainers ran the policy itself' in page
+    assert 'title="Replayed: the logged actions give these numbers."' in page
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"split": "test"}, "take an unseen split"),
+        ({"by": "expert"}, "claims a success of 0.0 to 56.1 %, but the policy itself reached 56.6"),
+    ],
+)
+def test_a_rerun_that_tells_otherwise_stops_the_build(
+    options: dict[str, Any], reason: str, folder: Path
+) -> None:
+    rerun(folder, "zero", **options)
+    with pytest.raises(ResultError, match=reason):
+        build(folder, replay=1, reruns=folder / "reruns")
+
+
+def test_a_rerun_of_other_weights_stops_the_build(folder: Path) -> None:
+    alter(rerun(folder, "zero"), split="unseen", policy_hash="other")
+    with pytest.raises(ResultError, match="policy_hash is other"):
+        build(folder, replay=1, reruns=folder / "reruns")
 
 
 def test_a_board_cannot_be_written_below_a_file(folder: Path) -> None:
     (folder / "file").write_text("")
     with pytest.raises(OutputError):
-        leaderboard.build(folder / "results", folder / "file")
+        leaderboard.build(folder / "results", folder / "file", draft=True)
 
 
 def test_it_runs_as_a_script(folder: Path) -> None:
     before = content_of(folder)
     script = [sys.executable, "eval/leaderboard.py"]
-    words = ["--results", folder / "results", "--out", folder / "out", "--replay", "1"]
+    words = ["--results", folder / "results", "--out", folder / "out", "--replay", "1", "--draft"]
+    words += ["--ledger", folder / "cache" / "replays.json"]
     done = subprocess.run([*script, *words], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.splitlines() == [
         str(folder / "out" / "LEADERBOARD.md"),
@@ -461,14 +594,25 @@ def test_the_script_says_in_one_line_what_is_wrong(
 
 
 @pytest.mark.skipif(not (COMMITTED / "LEADERBOARD.md").exists(), reason="no board is committed yet")
-def test_the_committed_board_is_what_the_committed_results_give(tmp_path: Path) -> None:
-    names = ("LEADERBOARD.md", "leaderboard.html", "verified.json", "clips")
-    for name in names:
+def test_the_committed_board_is_what_the_committed_results_give(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in (*BOARD, "clips"):
         source = COMMITTED / name
         (shutil.copytree if source.is_dir() else shutil.copy)(source, tmp_path / name)
     before = content_of(tmp_path)
     said: list[str] = []
-    leaderboard.build(COMMITTED / "results", tmp_path, say=said.append)
-    # Nothing was missing either: the clips and the ledger are committed with the board.
-    assert said == []
+    ledger = tmp_path.with_name("replays.json")
+    # They are played again one by one in test_submission; here it is what is drawn of them.
+    monkeypatch.setattr(
+        board_replays.verification, "verify", lambda path, *, sample, nonce: played_well(path)
+    )
+    leaderboard.build(COMMITTED / "results", tmp_path, ledger=ledger, say=said.append)
+    # No clip was missing either: they are committed with the board.
+    assert not any("drawing" in line for line in said)
     assert content_of(tmp_path) == before
+
+
+def played_well(path: Path) -> verification.Verdict:
+    n = result_file.load(path).summary.n_episodes
+    return verification.Verdict(n, min(n, board_replays.SAMPLE), 0, None, 0.0, 0.0)
