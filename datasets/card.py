@@ -82,13 +82,11 @@ def count(root: Path) -> Contents:
     scenarios: list[int] = []
     frames = 0
     for file in sorted({place.file for place in reader.read_places(root)}):
-        table = reader.read_table(root, file, ["episode_index", "next.success", SCENARIO])
-        frames += table.num_rows
-        scenarios += table.column(SCENARIO).to_pylist()
-        for episode, success in zip(
-            table["episode_index"].to_pylist(), table["next.success"].to_pylist(), strict=True
-        ):
-            outcomes[episode] = outcomes.get(episode, False) or bool(success)
+        rows = reader.read_numbers(root, file, ["episode_index", "next.success", SCENARIO])
+        frames += len(rows[SCENARIO])
+        scenarios += rows[SCENARIO].tolist()
+        for episode, success in zip(rows["episode_index"], rows["next.success"], strict=True):
+            outcomes[int(episode)] = outcomes.get(int(episode), False) or bool(success)
     own = (CARD, PICTURE)
     size = sum(
         path.stat().st_size
@@ -190,10 +188,10 @@ def draw_pictures(root: Path, info: dict[str, Any]) -> Any:
     titles = {"eih": "eye in hand", "eth": "eye to hand"}
     cameras = [camera for camera in titles if image_key(camera) in info["features"]]
     steps = np.unique(np.linspace(0, place.length - 1, _COLUMNS).round().astype(int))
-    fps = int(info["fps"])
+    fps = info["fps"]
     rows = {}
     for camera in cameras:
-        pictures = reader.read_pictures(root, place, table, image_key(camera), fps)
+        pictures = reader.read_pictures(root, info, place, table, image_key(camera))
         rows[titles[camera]] = [resize(pictures[step], _TILE_PX) for step in steps]
     return strip(rows, [step / fps for step in steps])
 

@@ -16,6 +16,7 @@ from typing import Any
 from hvs_suite.datasets.features import dataset_features
 from hvs_suite.datasets.metadata import (
     METADATA_FILE,
+    MOST_NAME,
     DatasetMetadata,
     jsonable,
     read_metadata,
@@ -216,7 +217,7 @@ def _check_numbers(episodes: int, split: str, noise: float, workers: int, block:
     """Refuses counts and noise that make no sense."""
     if episodes < 1:
         raise OptionError(f"episodes is {episodes}; record at least 1")
-    if not split.strip():
+    if not split.strip() or not split.isprintable() or len(split) > MOST_NAME:
         raise ScenarioError("a split is a name such as 'train'; name one with --split")
     if split == TEST_SPLIT and episodes > TEST_SCENARIOS:
         raise ScenarioError(
@@ -246,10 +247,10 @@ def _check_same_recording(root: Path, metadata: DatasetMetadata) -> None:
     found = read_metadata(root)
     if not found.same_recording(metadata):
         names = [
-            field.name
-            for field in dataclasses.fields(metadata)
-            if field.name not in ("command", "task_digest")
-            and getattr(found, field.name) != getattr(metadata, field.name)
+            name
+            for name in DatasetMetadata.model_fields
+            if name not in ("command", "task_digest")
+            and getattr(found, name) != getattr(metadata, name)
         ]
         raise DatasetError(
             f"{root} was recorded with another {', '.join(names) or 'meaning of the task'}; resume "

@@ -82,7 +82,7 @@ def replay(root: Path, episode: int) -> Replay:
     if table.num_rows == 0:
         raise DatasetError(f"{place.file} holds no frame of episode {episode}; see 'hvs check'")
     pictures = {
-        camera: reader.read_pictures(root, place, table, image_key(camera), int(info["fps"]))
+        camera: reader.read_pictures(root, info, place, table, image_key(camera))
         for camera in CAMERAS
         if image_key(camera) in info["features"]
     }

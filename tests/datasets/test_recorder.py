@@ -218,6 +218,7 @@ def test_a_folder_that_may_not_be_written_is_one_clear_line(tmp_path, monkeypatc
         ({"episodes": 0}, OptionError),
         ({"episodes": 1001, "split": "test"}, ScenarioError),
         ({"split": " "}, ScenarioError),
+        ({"split": "train\n\x1b[31m"}, ScenarioError),
         ({"noise": -0.1}, OptionError),
         ({"noise": float("nan")}, OptionError),
         ({"workers": 0}, OptionError),
@@ -237,7 +238,7 @@ def test_metadata_of_anything_else_is_refused(tmp_path):
     with pytest.raises(DatasetError, match=r"hvs\.json"):
         read_metadata(tmp_path)
     (tmp_path / "hvs.json").write_text("{")
-    with pytest.raises(DatasetError, match="damaged"):
+    with pytest.raises(DatasetError, match="is not JSON"):
         read_metadata(tmp_path)
     (tmp_path / "hvs.json").write_text('{"format": 99}')
     with pytest.raises(DatasetError, match="format"):
