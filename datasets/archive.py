@@ -34,6 +34,7 @@ _MOST_EXPANSION = 20
 _ALWAYS_ALLOWED_BYTES = 64 * 2**20
 _GZIP_MAGIC = b"\x1f\x8b"
 _CHUNK = 2**20
+_MOST_AT_ONCE = 16 * 2**20
 _LINE = re.compile(r"([0-9a-f]{64})  (\S.*)")
 
 
@@ -176,6 +177,8 @@ class _Bounded:
 
     def read(self, size: int) -> bytes:
         """Reads ``size`` bytes, as many as a header claims that it is long."""
+        if size > _MOST_AT_ONCE:
+            raise DatasetError(f"{self._archive} is no dataset: a header claims {size:,} bytes")
         self._check(size)
         return self._file.read(size)
 

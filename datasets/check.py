@@ -28,6 +28,7 @@ from hvs_suite.datasets.moments import Moments, compare, compare_all, merge, sam
 from hvs_suite.datasets.reader import DamagedFileError, Place
 from hvs_suite.datasets.resimulation import resimulate
 from hvs_suite.errors import DatasetError, HvsError
+from hvs_suite.names import shown
 from hvs_suite.registry import find
 from hvs_suite.rollout import play
 from hvs_suite.tasks.lock import digest
@@ -69,7 +70,7 @@ class Damage:
         if self.episode is not None:
             frame = "" if self.frame is None else f", frame {self.frame}"
             where.append(f"episode {self.episode}{frame}")
-        return _shown(": ".join([*where, self.what]))
+        return shown(": ".join([*where, self.what]))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,6 +128,7 @@ def check_dataset(
     damage += _check_info(info, features, variant, places)
     damage += _check_sentence(root, variant)
     damage += _check_order(places)
+    damage += _check_videos(info, places)
     unreadable, in_files = _check_files(root, places)
     damage += in_files
     sound = [place for place in places if place.file not in unreadable]
@@ -464,6 +466,18 @@ def _check_order(places: list[Place]) -> list[Damage]:
     return damage
 
 
+def _check_videos(info: Mapping[str, Any], places: Iterable[Place]) -> list[Damage]:
+    """Each episode has a video of what is declared as one, and of nothing else."""
+    declared = {name for name, each in info["features"].items() if each["dtype"] == "video"}
+    for place in places:
+        if wrong := sorted(declared ^ set(place.videos)):
+            what = (
+                f"{wrong[0]} is {'no ' if wrong[0] in place.videos else ''}video by {reader.INFO}"
+            )
+            return [Damage(place.listed_in, place.episode, None, what)]
+    return []
+
+
 def _check_files(root: Path, places: Iterable[Place]) -> tuple[set[str], list[Damage]]:
     """Every data file is there and readable, and holds the rows listed and no others.
 
@@ -527,11 +541,6 @@ def _check_statistics(
         dict.fromkeys(videos, _VIDEO_SLACK),
     )
     return damage + [Damage(reader.STATS, None, None, f"{name}: {w}") for name, w in wrong.items()]
-
-
-def _shown(text: str) -> str:
-    """Text of a stranger's for a terminal: what is no plain character is escaped."""
-    return "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text)
 
 
 def _order(damage: Damage) -> tuple[int, str, int, str]:

@@ -10,26 +10,19 @@ import pydantic
 
 from hvs_suite.errors import DatasetError
 from hvs_suite.files import replacing
+from hvs_suite.names import check_name
 from hvs_suite.reading import read_object, validated
 
 METADATA_FILE = "hvs.json"
 FORMAT = 1
-MOST_NAME = 200
-"""Characters of a task's or split's name."""
 _MOST_BYTES = 2**20
 
 
-def _printable(text: str) -> str:
-    if not text.isprintable():
-        raise ValueError("holds control characters or marks that cannot be seen")
-    return text
-
-
-# Shown in cards, films and terminals, and short.
+# Shown in cards, films and terminals.
 _Name = Annotated[
     str,
-    pydantic.StringConstraints(strict=True, min_length=1, max_length=MOST_NAME),
-    pydantic.AfterValidator(_printable),
+    pydantic.Strict(),
+    pydantic.AfterValidator(lambda name: check_name(name, "a name", error=DatasetError)),
 ]
 
 

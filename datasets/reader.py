@@ -88,6 +88,7 @@ class _Feature(pydantic.BaseModel):
 class _Info(pydantic.BaseModel):
     """What is read of ``meta/info.json``; whatever else is in it stays as it is."""
 
+    codebase_version: Annotated[str, pydantic.Field(pattern=r"^v\d{1,3}\.\d{1,3}$")] = "v3.0"
     features: dict[str, _Feature]
     fps: Annotated[int, pydantic.Field(ge=1, le=10_000, strict=True)]
     total_episodes: _Count
@@ -154,7 +155,7 @@ def read_sentences(root: Path) -> list[str]:
         table = read_table(root, TASKS, ["task_index", "task"])
         if table.num_rows > _MOST_SENTENCES:
             raise DatasetError(f"lists {table.num_rows:,} tasks; at most {_MOST_SENTENCES:,} fit")
-        order = np.argsort(column(table, "task_index"), axis=0).ravel()
+        order = np.argsort(_numbers(table, ["task_index"])["task_index"])
         return [str(sentence) for sentence in table.take(pa.array(order))["task"].to_pylist()]
 
 

@@ -16,13 +16,13 @@ from typing import Any
 from hvs_suite.datasets.features import dataset_features
 from hvs_suite.datasets.metadata import (
     METADATA_FILE,
-    MOST_NAME,
     DatasetMetadata,
     jsonable,
     read_metadata,
     write_metadata,
 )
 from hvs_suite.errors import DatasetError, HvsError, OptionError, OutputError, ScenarioError
+from hvs_suite.names import check_name
 from hvs_suite.registry import find
 from hvs_suite.rollout import play
 from hvs_suite.tasks.lock import digest
@@ -130,23 +130,26 @@ def record(
             workers=workers,
         )
         try:
-            with contextlib.closing(played):
-                for demonstration in in_order(played, len(outcomes)):
-                    # Not before there is something to keep: see below.
-                    if tracker.frames == 0:
-                        write_metadata(root, metadata)
-                    writer.save(demonstration)
-                    tracker.saved(demonstration.length, demonstration.success)
+            try:
+                with contextlib.closing(played):
+                    for demonstration in in_order(played, len(outcomes)):
+                        # Not before there is something to keep: see below.
+                        if tracker.frames == 0:
+                            write_metadata(root, metadata)
+                        writer.save(demonstration)
+                        tracker.saved(demonstration.length, demonstration.success)
+            except (KeyboardInterrupt, HvsError):
+                writer.publish()
+                raise
             writer.publish()
-        except KeyboardInterrupt:
-            writer.publish()
-            raise
-        except HvsError:
-            writer.publish()
-            raise
         except OSError as error:
+            if isinstance(error, HvsError):
+                raise
             writer.discard()
             saved = len(published_outcomes(root))
+            if not saved:
+                # The same command begins anew, with or without --resume.
+                (root / METADATA_FILE).unlink(missing_ok=True)
             raise OutputError(
                 f"cannot write {root}: {error.strerror or error}; {saved} of {episodes} episodes "
                 "are saved, go on with --resume"
@@ -217,8 +220,9 @@ def _check_numbers(episodes: int, split: str, noise: float, workers: int, block:
     """Refuses counts and noise that make no sense."""
     if episodes < 1:
         raise OptionError(f"episodes is {episodes}; record at least 1")
-    if not split.strip() or not split.isprintable() or len(split) > MOST_NAME:
+    if not split.strip():
         raise ScenarioError("a split is a name such as 'train'; name one with --split")
+    check_name(split, "the split", error=ScenarioError)
     if split == TEST_SPLIT and episodes > TEST_SCENARIOS:
         raise ScenarioError(
             f"split 'test' holds {TEST_SCENARIOS} scenarios, not {episodes}; record fewer, or "

@@ -401,16 +401,14 @@ def _drop_unpublished(root: Path) -> None:
         shutil.rmtree(root / "meta", ignore_errors=True)
         return
     count, _ = _counts(root)
-    kept: set[tuple[int, int]] = set()
-    for name in _episode_files(root):
-        rows = reader.read_numbers(root, name, ["episode_index", *_DATA_PLACE])
-        if rows["episode_index"].min() >= count:
-            (root / name).unlink()
-        else:
-            kept |= set(zip(*(rows[place].tolist() for place in _DATA_PLACE), strict=True))
-    wanted = {
-        root / "data" / f"chunk-{chunk:03d}" / f"file-{file:03d}.parquet" for chunk, file in kept
-    }
+    places = reader.read_places(root)
+    kept = [place for place in places if place.episode < count]
+    wanted = {place.file for place in kept}
+    if lacking := sorted(name for name in wanted if not (root / name).is_file()):
+        # Another list than that of these files: none of them is known to be superfluous.
+        raise reader.DamagedFileError(lacking[0], "is missing; record the dataset again")
+    for name in {place.listed_in for place in places} - {place.listed_in for place in kept}:
+        (root / name).unlink()
     for path in (root / "data").glob("*/*.parquet"):
-        if path not in wanted:
+        if path.relative_to(root).as_posix() not in wanted:
             path.unlink()

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 from hvs_suite.errors import HvsError
+from hvs_suite.names import shown
 
 # Name -> where its dataclass lives. Those modules import nothing heavy at the top, so that
 # `hvs --help` answers at once.
@@ -96,8 +97,8 @@ def _quieten_libraries() -> None:
 
 
 def complain(reason: str) -> None:
-    """Print one line to stderr, whatever line breaks the reason holds."""
-    print(f"hvs: {' '.join(reason.split())}", file=sys.stderr)
+    """Print one line to stderr, whatever line breaks and escape sequences the reason holds."""
+    print(f"hvs: {shown(' '.join(reason.split()))}", file=sys.stderr)
 
 
 def parse(arguments: Sequence[str]) -> Command:
