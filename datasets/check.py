@@ -254,8 +254,8 @@ class CheckEpisode:
                 findings.damage.append(Damage(place.file, place.episode, None, what))
                 continue
             columns[name] = values
-            bad = np.flatnonzero(~np.isfinite(values.astype(np.float64)).reshape(len(values), -1)
-                                 .all(axis=1))  # fmt: skip
+            finite = np.isfinite(values.astype(np.float64))
+            bad = np.flatnonzero(~finite.all(axis=tuple(range(1, finite.ndim))))
             if len(bad):
                 what = f"{name} holds NaN or infinity"
                 findings.damage.append(Damage(place.file, place.episode, int(bad[0]), what))

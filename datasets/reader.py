@@ -42,7 +42,8 @@ _PLACE_COLUMNS = (
 )
 # Values of a frame in one feature: beyond any camera, and still a small file.
 _MOST_VALUES = 64 * 2**20
-_MOST_SENTENCES = 1000
+_MOST_SENTENCES = 10
+_LONGEST_SENTENCE = 1000
 
 Picture = npt.NDArray[np.uint8]
 _Count = Annotated[int, pydantic.Field(ge=0, lt=2**53, strict=True)]
@@ -154,9 +155,12 @@ def read_sentences(root: Path) -> list[str]:
     with in_file(root, TASKS):
         table = read_table(root, TASKS, ["task_index", "task"])
         if table.num_rows > _MOST_SENTENCES:
-            raise DatasetError(f"lists {table.num_rows:,} tasks; at most {_MOST_SENTENCES:,} fit")
+            raise DatasetError(f"lists {table.num_rows:,} tasks; a recording has one")
         order = np.argsort(_numbers(table, ["task_index"])["task_index"])
-        return [str(sentence) for sentence in table.take(pa.array(order))["task"].to_pylist()]
+        sentences = [str(table["task"][int(row)].as_py()) for row in order]
+        if any(len(sentence) > _LONGEST_SENTENCE for sentence in sentences):
+            raise DatasetError(f"holds a sentence of more than {_LONGEST_SENTENCE:,} characters")
+        return sentences
 
 
 def read_places(root: Path) -> list[Place]:

@@ -62,11 +62,12 @@ def check_regular(
         HvsError: As `error`: it is missing, a folder, a FIFO, a device, outside, or too large.
     """
     try:
-        if within is not None and not path.resolve().is_relative_to(within.resolve()):
-            raise error(f"{path}: leads out of {within}; only files inside it are read")
+        inside = within is None or path.resolve().is_relative_to(within.resolve())
         found = path.stat()
     except (OSError, ValueError, RuntimeError) as reason:
         raise error(f"{path}: cannot be read ({_why(reason)})") from reason
+    if not inside:
+        raise error(f"{path}: leads out of {within}; only files inside it are read")
     if not stat.S_ISREG(found.st_mode):
         kind = "a folder" if stat.S_ISDIR(found.st_mode) else "no regular file"
         raise error(f"{path}: is {kind}; a file is expected")

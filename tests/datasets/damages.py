@@ -271,6 +271,10 @@ DAMAGES: dict[str, Damage] = {
     "a scenario is negative": column(DATA, "privileged.scenario", lambda rows: [-5] * len(rows)),
     "a scenario is huge": column(DATA, "privileged.scenario", lambda rows: [2**62] * len(rows)),
     "frames are doubled": table_with(DATA, doubled),
+    "an episode has no rows": table_with(
+        DATA,
+        lambda table: table.filter(pa.array(np.asarray(table.column("episode_index")) != 0)),
+    ),
     "no rows": table_with(DATA, lambda table: table[:0]),
     "a column twice": table_with(
         DATA, lambda table: table.append_column("action", table.column("action"))
