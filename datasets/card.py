@@ -231,7 +231,10 @@ def _images(info: dict[str, Any]) -> str:
             how = "PNG, lossless"
             if feature["dtype"] == "video":
                 video = feature.get("info") or {}
-                how = f"video, {_code(str(video.get('video.codec', 'unknown')))}, lossy"
+                codec = str(video.get("video.codec"))
+                # Any other text is no codec's name, and has no place in a page.
+                codec = codec if re.fullmatch(r"[a-z0-9_.-]{1,32}", codec) else "unknown"
+                how = f"video, {codec}, lossy"
             kept.append(f"{_code(key)} {width} x {height} px ({how})")
     return "; ".join(kept) or "none"
 

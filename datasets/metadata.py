@@ -4,7 +4,7 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 import pydantic
 
@@ -14,7 +14,7 @@ from hvs_suite.names import check_name
 from hvs_suite.reading import read_object, validated
 
 METADATA_FILE = "hvs.json"
-FORMAT = 1
+FORMAT: Final = 1
 _MOST_BYTES = 2**20
 
 
