@@ -2,7 +2,7 @@
 
 The same dataset gives the same bytes: members are sorted and carry neither times nor owners. What
 comes back is trusted no further than its checksums: only plain files below the target, all of them
-listed, none twice.
+listed, none twice, and together no larger than a packed dataset unpacks to.
 """
 
 import gzip
@@ -14,18 +14,27 @@ import shutil
 import stat
 import tarfile
 import tempfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
+from typing import IO
 
+from hvs_suite.datasets.metadata import DatasetMetadata, read_metadata
 from hvs_suite.datasets.writer import STAGE
 from hvs_suite.errors import DatasetError, OutputError
 from hvs_suite.files import replacing
+from hvs_suite.reading import check_regular
 
 CHECKSUMS = "SHA256SUMS"
 SUFFIXES = (".tar", ".tar.gz", ".tgz")
-_MAX_CHECKSUMS_BYTES = 64 * 2**20
+_MAX_CHECKSUMS_BYTES = 8 * 2**20
+# Pictures and parquet are compressed already: gzip makes next to nothing of them.
+_MOST_EXPANSION = 20
+_ALWAYS_ALLOWED_BYTES = 64 * 2**20
+_GZIP_MAGIC = b"\x1f\x8b"
 _CHUNK = 2**20
+_MOST_AT_ONCE = 16 * 2**20
 _LINE = re.compile(r"([0-9a-f]{64})  (\S.*)")
 
 
@@ -58,7 +67,7 @@ def pack(root: Path, archive: Path) -> str:
     return _sha256(archive)
 
 
-def unpack(archive: Path, out: Path, sha256: str | None = None) -> int:
+def unpack(archive: Path, out: Path, sha256: str | None = None) -> tuple[int, DatasetMetadata]:
     """Unpacks a dataset into a new folder and checks every file.
 
     Args:
@@ -67,14 +76,13 @@ def unpack(archive: Path, out: Path, sha256: str | None = None) -> int:
         sha256: What the archive's own checksum must be, where it is known.
 
     Returns:
-        Number of files.
+        Number of files, and the dataset's origin.
 
     Raises:
         OutputError: ``out`` is not empty or cannot be written.
         DatasetError: The archive is damaged, or not one of ours; nothing is left of it.
     """
-    if not archive.is_file():
-        raise DatasetError(f"there is no archive {archive}")
+    check_regular(archive, error=DatasetError)
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise OutputError(f"{out} is not empty; choose another folder")
     if sha256 is not None and _sha256(archive) != sha256.strip().lower():
@@ -86,19 +94,22 @@ def unpack(archive: Path, out: Path, sha256: str | None = None) -> int:
         raise OutputError(f"cannot write {out}: {error.strerror or error}") from error
     try:
         count = _unpack_into(archive, stage)
+        metadata = read_metadata(stage)
         stage.chmod(0o755)
         if out.exists():
             out.rmdir()
         stage.replace(out)
-    except (tarfile.TarError, EOFError, gzip.BadGzipFile) as error:
+    except OutputError:
+        raise
+    except DatasetError as error:
+        raise DatasetError(str(error).replace(str(stage), str(archive))) from None
+    except _NO_TAR as error:
         raise DatasetError(f"{archive} is damaged or no tar archive ({error})") from None
     except OSError as error:
-        if isinstance(error, OutputError):
-            raise
         raise OutputError(f"cannot unpack {archive}: {error.strerror or error}") from error
     finally:
         shutil.rmtree(stage, ignore_errors=True)
-    return count
+    return count, metadata
 
 
 def check_suffix(archive: Path) -> None:
@@ -113,10 +124,10 @@ def check_suffix(archive: Path) -> None:
 
 def _unpack_into(archive: Path, stage: Path) -> int:
     """Writes the members below ``stage``; the checksums come first."""
-    with tarfile.open(archive, "r|*") as tar:
+    with _unpacked(archive) as file, tarfile.open(fileobj=file, mode="r:") as tar:
         members = iter(tar)
         first = next(members, None)
-        if first is None or first.name != CHECKSUMS or not first.isreg():
+        if first is None or first.name != CHECKSUMS or not _is_plain(first):
             raise DatasetError(
                 f"{archive} does not begin with {CHECKSUMS}; not made by 'hvs share'"
             )
@@ -125,7 +136,7 @@ def _unpack_into(archive: Path, stage: Path) -> int:
         listed = _listed(archive, _content(tar, first).read().decode("utf-8", "replace"))
         waiting = dict(listed)
         for member in members:
-            if not member.isreg():
+            if not _is_plain(member):
                 raise DatasetError(f"{archive} holds {member.name!r}, which is no plain file")
             if member.name not in waiting:
                 raise DatasetError(
@@ -135,6 +146,72 @@ def _unpack_into(archive: Path, stage: Path) -> int:
         if waiting:
             raise DatasetError(f"{archive} lacks {', '.join(sorted(waiting)[:3])}")
     return len(listed)
+
+
+# What tarfile and zlib say of other files: headers that are no text, no numbers, or endless.
+_NO_TAR = (
+    tarfile.TarError,
+    gzip.BadGzipFile,
+    zlib.error,
+    EOFError,
+    ValueError,
+    OverflowError,
+    LookupError,
+    RecursionError,
+)
+
+
+class _Bounded:
+    """A file that is read once, forwards, and up to a limit.
+
+    Args:
+        file: What to read.
+        most: Bytes that may come of it.
+        archive: For the message.
+    """
+
+    def __init__(self, file: IO[bytes], most: int, archive: Path) -> None:
+        self._file = file
+        self._most = most
+        self._archive = archive
+
+    def read(self, size: int) -> bytes:
+        """Reads ``size`` bytes, as many as a header claims that it is long."""
+        if size > _MOST_AT_ONCE:
+            raise DatasetError(f"{self._archive} is no dataset: a header claims {size:,} bytes")
+        self._check(size)
+        return self._file.read(size)
+
+    def seek(self, position: int) -> int:
+        """Goes on to a place, as far as a header claims that a member reaches."""
+        self._check(position - self.tell())
+        return self._file.seek(position)
+
+    def tell(self) -> int:
+        """The place."""
+        return self._file.tell()
+
+    def _check(self, size: int) -> None:
+        if self.tell() + size > self._most:
+            raise DatasetError(
+                f"{self._archive} would unpack to more than {self._most:,} bytes; it is no dataset"
+            )
+
+
+@contextmanager
+def _unpacked(archive: Path) -> Iterator[IO[bytes]]:
+    """The bytes of the tar in an archive."""
+    most = _ALWAYS_ALLOWED_BYTES + _MOST_EXPANSION * archive.stat().st_size
+    with archive.open("rb") as file:
+        packed = file.read(len(_GZIP_MAGIC)) == _GZIP_MAGIC
+        file.seek(0)
+        with gzip.GzipFile(fileobj=file) if packed else file as content:
+            yield _Bounded(content, most, archive)  # type: ignore[arg-type,misc]
+
+
+def _is_plain(member: tarfile.TarInfo) -> bool:
+    """Whether a member is a file whose bytes are all there: a sparse one unpacks to any size."""
+    return member.isreg() and not member.issparse()
 
 
 def _listed(archive: Path, text: str) -> dict[str, str]:

@@ -4,6 +4,7 @@
 """
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from hvs_suite.datasets import reader
 from hvs_suite.datasets.features import SCENARIO, image_key
 from hvs_suite.datasets.metadata import DatasetMetadata, read_metadata
 from hvs_suite.files import replacing
+from hvs_suite.names import shown
 from hvs_suite.registry import find
 from hvs_suite.tasks.shared.lock import digest
 from hvs_suite.tasks.shared.spec import Spec
@@ -82,13 +84,11 @@ def count(root: Path) -> Contents:
     scenarios: list[int] = []
     frames = 0
     for file in sorted({place.file for place in reader.read_places(root)}):
-        table = reader.read_table(root, file, ["episode_index", "next.success", SCENARIO])
-        frames += table.num_rows
-        scenarios += table.column(SCENARIO).to_pylist()
-        for episode, success in zip(
-            table["episode_index"].to_pylist(), table["next.success"].to_pylist(), strict=True
-        ):
-            outcomes[episode] = outcomes.get(episode, False) or bool(success)
+        rows = reader.read_numbers(root, file, ["episode_index", "next.success", SCENARIO])
+        frames += len(rows[SCENARIO])
+        scenarios += rows[SCENARIO].tolist()
+        for episode, success in zip(rows["episode_index"], rows["next.success"], strict=True):
+            outcomes[int(episode)] = outcomes.get(int(episode), False) or bool(success)
     own = (CARD, PICTURE)
     size = sum(
         path.stat().st_size
@@ -118,7 +118,7 @@ def describe(
     """
     variant = find(metadata.task).with_options(metadata.options)
     share = 100.0 * contents.successes / max(1, contents.episodes)
-    options = ", ".join(f"`{k}={v!r}`" for k, v in sorted(metadata.options.items())) or "as named"
+    options = ", ".join(_code(f"{k}={v!r}") for k, v in sorted(metadata.options.items()))
     noise = (
         f"temporally correlated, {metadata.noise:g} rad far from the goal, on what is executed "
         f"(`privileged.action_executed`); `action` is the expert's own"
@@ -128,10 +128,10 @@ def describe(
     rows = {
         "task": f"`{metadata.task}`, version {metadata.task_version}",
         "task digest": f"`{metadata.task_digest or digest(metadata.task)}`",
-        "options": options,
+        "options": options or "as named",
         "instruction": variant.instruction(),
         "robot": f"KUKA LBR iiwa 7 R800, {JOINT_NAMES[0]} to {JOINT_NAMES[-1]}, simulated (MuJoCo)",
-        "split and scenarios": f"`{metadata.split}`, {contents.scenarios[0]} to "
+        "split and scenarios": f"{_code(metadata.split)}, {contents.scenarios[0]} to "
         f"{contents.scenarios[1]}",
         "episodes": f"{contents.episodes:,}",
         "frames": f"{contents.frames:,} at {info['fps']} a second, "
@@ -144,6 +144,9 @@ def describe(
         "size": f"{contents.size_mb:.1f} MB",
         "licence": licence,
     }
+    command = shown(metadata.command) or "# the command was not kept"
+    # A fence longer than any in the command: the text inside cannot close it.
+    fence = "`" * max(3, 1 + max((len(run) for run in re.findall("`+", command)), default=0))
     lines = [
         f"# {metadata.task}: demonstrations for visual servoing",
         "",
@@ -158,9 +161,9 @@ def describe(
         "",
         "Made by:",
         "",
-        "```sh",
-        metadata.command or "# the command was not kept",
-        "```",
+        fence + "sh",
+        command,
+        fence,
         "",
         "`observation.*` is what a policy may see. `privileged.*` is the simulator's truth, for "
         "training and checks only. `hvs.json` holds task, split, options and noise, from which "
@@ -190,10 +193,10 @@ def draw_pictures(root: Path, info: dict[str, Any]) -> Any:
     titles = {"eih": "eye in hand", "eth": "eye to hand"}
     cameras = [camera for camera in titles if image_key(camera) in info["features"]]
     steps = np.unique(np.linspace(0, place.length - 1, _COLUMNS).round().astype(int))
-    fps = int(info["fps"])
+    fps = info["fps"]
     rows = {}
     for camera in cameras:
-        pictures = reader.read_pictures(root, place, table, image_key(camera), fps)
+        pictures = reader.read_pictures(root, info, place, table, image_key(camera))
         rows[titles[camera]] = [resize(pictures[step], _TILE_PX) for step in steps]
     return strip(rows, [step / fps for step in steps])
 
@@ -228,9 +231,18 @@ def _images(info: dict[str, Any]) -> str:
             how = "PNG, lossless"
             if feature["dtype"] == "video":
                 video = feature.get("info") or {}
-                how = f"video, {video.get('video.codec', 'unknown')}, lossy"
-            kept.append(f"`{key}` {width} x {height} px ({how})")
+                codec = str(video.get("video.codec"))
+                # Any other text is no codec's name, and has no place in a page.
+                codec = codec if re.fullmatch(r"[a-z0-9_.-]{1,32}", codec) else "unknown"
+                how = f"video, {codec}, lossy"
+            kept.append(f"{_code(key)} {width} x {height} px ({how})")
     return "; ".join(kept) or "none"
+
+
+def _code(text: str) -> str:
+    """Text of a stranger's as code in a table, which it can neither end nor leave."""
+    plain = shown(text).replace("`", "'").replace("|", "\\|")
+    return f"`{plain}`"
 
 
 def _tolerance(variant: Spec) -> str:

@@ -8,12 +8,11 @@ import contextlib
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from hvs_suite.datasets import reader
 from hvs_suite.datasets.demonstration import MakeEnvironment
@@ -26,9 +25,10 @@ from hvs_suite.datasets.features import (
 )
 from hvs_suite.datasets.metadata import METADATA_FILE, DatasetMetadata, read_metadata
 from hvs_suite.datasets.moments import Moments, compare, compare_all, merge, sample
-from hvs_suite.datasets.reader import Place
+from hvs_suite.datasets.reader import DamagedFileError, Place
 from hvs_suite.datasets.resimulation import resimulate
 from hvs_suite.errors import DatasetError, HvsError
+from hvs_suite.names import shown
 from hvs_suite.registry import find
 from hvs_suite.rollout import play
 from hvs_suite.tasks.shared.lock import digest
@@ -59,13 +59,18 @@ class Damage:
     frame: int | None
     what: str
 
+    @classmethod
+    def of(cls, error: DamagedFileError, episode: int | None = None) -> Self:
+        """What a reader found."""
+        return cls(error.file, episode, None, error.what)
+
     def __str__(self) -> str:
-        """One line."""
+        """One line, whatever the names and texts in the dataset hold."""
         where = [self.file]
         if self.episode is not None:
             frame = "" if self.frame is None else f", frame {self.frame}"
             where.append(f"episode {self.episode}{frame}")
-        return ": ".join([*where, self.what])
+        return shown(": ".join([*where, self.what]))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,7 +110,7 @@ def check_dataset(
         DatasetError: There is no dataset here, or it belongs to another meaning of its task.
         RenderError: Pictures cannot be drawn on this machine.
     """
-    if not (root / "meta").is_dir() and not (root / METADATA_FILE).is_file():
+    if not (root / "meta").exists() and not (root / METADATA_FILE).exists():
         raise DatasetError(f"{root} holds no dataset; name the root of one made by 'hvs record'")
     try:
         metadata = read_metadata(root)
@@ -118,17 +123,17 @@ def check_dataset(
     try:
         info = reader.read_info(root)
         places = reader.read_places(root)
-    except DatasetError as error:
-        file, _, what = str(error).partition(" ")
-        return Report(0, 0, (Damage(file, None, None, what),))
+    except DamagedFileError as error:
+        return Report(0, 0, (Damage.of(error),))
     damage += _check_info(info, features, variant, places)
     damage += _check_sentence(root, variant)
     damage += _check_order(places)
+    damage += _check_videos(info, places)
     unreadable, in_files = _check_files(root, places)
     damage += in_files
     sound = [place for place in places if place.file not in unreadable]
     job = CheckEpisode(
-        root, metadata, {place.episode: place for place in sound}, features, pictures
+        root, metadata, {place.episode: place for place in sound}, features, info, pictures
     )
     options = dict(metadata.options) if pictures else {**metadata.options, "observations": "state"}
     merged: dict[str, list[Moments]] = {}
@@ -155,7 +160,7 @@ def check_dataset(
     if not unreadable:
         # A feature that some episode could not give has no statistics to compare.
         whole = {name: each for name, each in merged.items() if len(each) == checked}
-        damage += _check_statistics(root, features, whole)
+        damage += _check_statistics(root, info, features, whole)
     return Report(checked, frames, tuple(sorted(set(damage), key=_order)))
 
 
@@ -185,6 +190,7 @@ class CheckEpisode:
         metadata: Its origin.
         places: Where each episode lies.
         features: The features it must have.
+        info: ``meta/info.json``.
         pictures: Draw every frame again.
     """
 
@@ -192,6 +198,7 @@ class CheckEpisode:
     metadata: DatasetMetadata
     places: Mapping[int, Place]
     features: Mapping[str, Mapping[str, Any]]
+    info: Mapping[str, Any]
     pictures: bool
 
     def __call__(self, env: Any, policy: Any, episode: int) -> EpisodeFindings:
@@ -200,8 +207,8 @@ class CheckEpisode:
         findings = EpisodeFindings(episode, 0, [], {})
         try:
             table = reader.read_episode(self.root, place)
-        except DatasetError as error:
-            findings.damage.append(Damage(place.file, episode, None, str(error)))
+        except DamagedFileError as error:
+            findings.damage.append(Damage.of(error, episode))
             return findings
         columns = self._columns(place, table, findings)
         self._check_numbering(place, columns, findings)
@@ -247,8 +254,8 @@ class CheckEpisode:
                 findings.damage.append(Damage(place.file, place.episode, None, what))
                 continue
             columns[name] = values
-            bad = np.flatnonzero(~np.isfinite(values.astype(np.float64)).reshape(len(values), -1)
-                                 .all(axis=1))  # fmt: skip
+            finite = np.isfinite(values.astype(np.float64))
+            bad = np.flatnonzero(~finite.all(axis=tuple(range(1, finite.ndim))))
             if len(bad):
                 what = f"{name} holds NaN or infinity"
                 findings.damage.append(Damage(place.file, place.episode, int(bad[0]), what))
@@ -301,36 +308,25 @@ class CheckEpisode:
     ) -> dict[int, npt.NDArray[np.uint8]]:
         """The pictures of a camera by frame; those that cannot be decoded are damage."""
         if key in place.videos:
-            pictures = self._decode_video(place, key, findings)
-        elif key in table.column_names:
-            pictures = {}
-            for frame, stored in enumerate(table.column(key).to_pylist()):
-                try:
-                    pictures[frame] = reader.decode(stored)
-                except DatasetError as error:
-                    findings.damage.append(
-                        Damage(place.file, place.episode, frame, f"{key} {error}")
-                    )
-        else:
-            return {}
-        shape = tuple(self.features[key]["shape"])
-        for frame, picture in pictures.items():
-            if picture.shape != shape:
-                what = f"{key} has shape {picture.shape}, not {shape}"
+            return self._decode_video(place, key, findings)
+        pictures = {}
+        shape = reader.shape_of({"features": self.features}, key)
+        for frame, stored in enumerate(table.column(key) if key in table.column_names else ()):
+            try:
+                pictures[frame] = reader.decode(stored.as_py(), shape)
+            except DatasetError as error:
+                what = f"{key} {error}"
                 findings.damage.append(Damage(place.file, place.episode, frame, what))
-                break
         return pictures
 
     def _decode_video(
         self, place: Place, key: str, findings: EpisodeFindings
     ) -> dict[int, npt.NDArray[np.uint8]]:
-        file, start_s = place.videos[key]
-        fps = int(reader.read_info(self.root)["fps"])
+        file, _ = place.videos[key]
         try:
-            pictures = reader.decode_video(self.root, file, start_s, place.length, fps)
-        except DatasetError as error:
-            what = str(error).removeprefix(f"{file} ")
-            findings.damage.append(Damage(file, place.episode, None, what))
+            pictures = reader.decode_video(self.root, self.info, place, key)
+        except DamagedFileError as error:
+            findings.damage.append(Damage.of(error, place.episode))
             return {}
         if len(pictures) < place.length:
             what = f"ends after {len(pictures)} of {place.length} frames"
@@ -345,7 +341,11 @@ class CheckEpisode:
         findings: EpisodeFindings,
     ) -> None:
         """Compares the episode's listed statistics, and keeps its moments for the dataset's."""
-        listed = reader.listed_statistics(self.root, place)
+        try:
+            listed = reader.listed_statistics(self.root, place)
+        except DamagedFileError as error:
+            findings.damage.append(Damage.of(error, place.episode))
+            return
         for name, values in columns.items():
             if name in listed and name not in _NUMBERING and len(values):
                 findings.moments[name] = Moments.of(values.reshape(len(values), -1))
@@ -443,9 +443,8 @@ def _check_info(
 def _check_sentence(root: Path, variant: Spec) -> list[Damage]:
     try:
         sentences = reader.read_sentences(root)
-    except DatasetError as error:
-        what = str(error).removeprefix(f"{reader.TASKS} ")
-        return [Damage(reader.TASKS, None, None, what)]
+    except DamagedFileError as error:
+        return [Damage.of(error)]
     if sentences != [variant.instruction()]:
         return [Damage(reader.TASKS, None, None, f"{sentences} is not the task's sentence")]
     return []
@@ -467,6 +466,18 @@ def _check_order(places: list[Place]) -> list[Damage]:
     return damage
 
 
+def _check_videos(info: Mapping[str, Any], places: Iterable[Place]) -> list[Damage]:
+    """Each episode has a video of what is declared as one, and of nothing else."""
+    declared = {name for name, each in info["features"].items() if each["dtype"] == "video"}
+    for place in places:
+        if wrong := sorted(declared ^ set(place.videos)):
+            what = (
+                f"{wrong[0]} is {'no ' if wrong[0] in place.videos else ''}video by {reader.INFO}"
+            )
+            return [Damage(place.listed_in, place.episode, None, what)]
+    return []
+
+
 def _check_files(root: Path, places: Iterable[Place]) -> tuple[set[str], list[Damage]]:
     """Every data file is there and readable, and holds the rows listed and no others.
 
@@ -482,17 +493,18 @@ def _check_files(root: Path, places: Iterable[Place]) -> tuple[set[str], list[Da
         episodes = [place.episode for place in inside]
         held = f"holds episodes {min(episodes)} to {max(episodes)} and"
         try:
-            table = reader.read_table(root, file, ["episode_index"])
+            table = reader.read_table(root, file)
+            numbers = reader.column(table, "episode_index")
         except DatasetError as error:
             unreadable.add(file)
-            what = str(error).removeprefix(f"{file} ")
+            what = error.what if isinstance(error, DamagedFileError) else str(error)
             damage.append(Damage(file, None, None, f"{held} {what}"))
             continue
-        stray = set(np.asarray(table["episode_index"]).tolist()) - set(episodes)
+        stray = set(numbers.ravel().tolist()) - set(episodes)
         for episode in sorted(stray)[:_LISTED_DAMAGE]:
             damage.append(Damage(file, episode, None, "is listed nowhere in this file"))
         wanted = set(_columns_of(root)) - set(inside[0].videos)
-        lacking = sorted(wanted - set(pq.read_schema(root / file).names))
+        lacking = sorted(wanted - set(table.column_names))
         if lacking:
             damage.append(Damage(file, None, None, f"lacks the columns {', '.join(lacking)}"))
     for path in sorted((root / "data").glob("*/*.parquet")):
@@ -511,16 +523,16 @@ def _columns_of(root: Path) -> list[str]:
 
 def _check_statistics(
     root: Path,
+    info: Mapping[str, Any],
     features: Mapping[str, Mapping[str, Any]],
     merged: Mapping[str, list[Moments]],
 ) -> list[Damage]:
     """Compares the dataset's statistics with those of all its frames."""
     try:
         stats = reader.read_stats(root)
-        videos = {k for k, f in reader.read_info(root)["features"].items() if f["dtype"] == "video"}
-    except DatasetError as error:
-        what = str(error).removeprefix(f"{reader.STATS} ")
-        return [Damage(reader.STATS, None, None, what)]
+    except DamagedFileError as error:
+        return [Damage.of(error)]
+    videos = {name for name, feature in info["features"].items() if feature["dtype"] == "video"}
     lacking = [name for name in features if name not in stats]
     damage = [Damage(reader.STATS, None, None, f"lacks {name}") for name in lacking]
     wrong = compare_all(

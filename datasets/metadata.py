@@ -1,20 +1,32 @@
 """``hvs.json``: what a dataset was recorded from, beside LeRobot's own ``meta/``."""
 
-import dataclasses
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Final, Literal
+
+import pydantic
 
 from hvs_suite.errors import DatasetError
 from hvs_suite.files import replacing
+from hvs_suite.names import check_name
+from hvs_suite.reading import read_object, validated
 
 METADATA_FILE = "hvs.json"
-FORMAT = 1
+FORMAT: Final = 1
+_MOST_BYTES = 2**20
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class DatasetMetadata:
+# Shown in cards, films and terminals.
+_Name = Annotated[
+    str,
+    pydantic.Strict(),
+    pydantic.AfterValidator(lambda name: check_name(name, "a name", error=DatasetError)),
+]
+
+
+class DatasetMetadata(pydantic.BaseModel, frozen=True):
     """Origin of a dataset: enough to play its scenarios again.
 
     Attributes:
@@ -29,21 +41,22 @@ class DatasetMetadata:
         format: Version of this file.
     """
 
-    task: str
-    task_version: int
-    split: str
-    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    noise: float = 0.0
-    command: str = ""
-    task_digest: str = ""
-    format: int = FORMAT
+    task: _Name
+    task_version: Annotated[int, pydantic.Field(strict=True, ge=0)]
+    split: _Name
+    options: Mapping[str, Any] = {}
+    noise: Annotated[float, pydantic.Field(ge=0.0, allow_inf_nan=False)] = 0.0
+    command: Annotated[str, pydantic.StringConstraints(strict=True, max_length=100_000)] = ""
+    task_digest: Annotated[str, pydantic.StringConstraints(pattern="^([0-9a-f]{64})?$")] = ""
+    format: Literal[1] = FORMAT
 
     def same_recording(self, other: "DatasetMetadata") -> bool:
         """Whether both describe the same demonstrations, whatever command asked for them."""
         own, others = self, other
         if not (self.task_digest and other.task_digest):
-            own, others = (dataclasses.replace(each, task_digest="") for each in (self, other))
-        return dataclasses.replace(own, command="") == dataclasses.replace(others, command="")
+            own, others = (each.model_copy(update={"task_digest": ""}) for each in (self, other))
+        left, right = (each.model_copy(update={"command": ""}) for each in (own, others))
+        return left == right
 
 
 def write_metadata(root: Path, metadata: DatasetMetadata) -> None:
@@ -52,7 +65,7 @@ def write_metadata(root: Path, metadata: DatasetMetadata) -> None:
     Raises:
         OutputError: The folder cannot be written.
     """
-    text = json.dumps(dataclasses.asdict(metadata), indent=2) + "\n"
+    text = json.dumps(metadata.model_dump(), indent=2) + "\n"
     with replacing(root / METADATA_FILE) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
@@ -70,22 +83,17 @@ def read_metadata(root: str | Path) -> DatasetMetadata:
         DatasetError: There is no such file, or it was not written by this suite.
     """
     path = Path(root) / METADATA_FILE
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError:
+    if not os.path.lexists(path):
         raise DatasetError(
             f"{root} holds no {METADATA_FILE}: name the root of a dataset made by 'hvs record'"
-        ) from None
-    except ValueError as error:
-        raise DatasetError(f"{path} is damaged ({error}); record the dataset again") from None
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        )
+    content = read_object(path, error=DatasetError, within=Path(root), most=_MOST_BYTES)
+    if content.get("format") != FORMAT:
         raise DatasetError(f"{path} has another format than {FORMAT}; update hvs-suite")
-    names = {field.name for field in dataclasses.fields(DatasetMetadata)}
-    content.setdefault("task_digest", "")
-    try:
-        return DatasetMetadata(**{name: content[name] for name in names})
-    except KeyError as error:
-        raise DatasetError(f"{path} lacks {error}; record the dataset again") from None
+    for name in sorted(set(DatasetMetadata.model_fields) - {"task_digest"}):
+        if name not in content:
+            raise DatasetError(f"{path} lacks {name!r}; record the dataset again")
+    return validated(DatasetMetadata, content, path, error=DatasetError)
 
 
 def jsonable(options: Mapping[str, Any]) -> dict[str, Any]:

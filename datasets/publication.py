@@ -19,7 +19,7 @@ from hvs_suite.datasets.card import TAGS
 from hvs_suite.datasets.metadata import METADATA_FILE, read_metadata
 from hvs_suite.errors import DatasetError, OptionError, ServerError
 
-_REPO = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}")
+_REPO = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}", re.ASCII)
 # Named so that LeRobot does not probe torchcodec, which complains at length without FFmpeg.
 _VIDEO_BACKEND = "pyav"
 

@@ -57,10 +57,7 @@ class VideoCopy:
                 raise DatasetError(f"{self.video} lacks episode {place.episode}, or part of it")
             pictures = {}
             for key in keys:
-                file, start_s = copy.videos[key]
-                decoded = reader.decode_video(
-                    self.video, file, start_s, place.length, int(info["fps"])
-                )
+                decoded = reader.decode_video(self.video, info, copy, key)
                 if len(decoded) != place.length:
                     raise DatasetError(
                         f"{self.video}: episode {place.episode}: {key} has {len(decoded)} frames, "
@@ -86,7 +83,7 @@ class VideoCopy:
         counters = lerobot_files.with_counters({})
         features = {k: v for k, v in info["features"].items() if k not in counters}
         [sentence] = reader.read_sentences(self.data)
-        writer = DatasetWriter(out, features, int(info["fps"]), sentence, EPISODES_A_BLOCK)
+        writer = DatasetWriter(out, features, info["fps"], sentence, EPISODES_A_BLOCK)
         for _, table, pictures in self.episodes():
             writer.save(_demonstration(features, table, pictures))
             if on_episode is not None:

@@ -22,6 +22,7 @@ from hvs_suite.datasets.metadata import (
     write_metadata,
 )
 from hvs_suite.errors import DatasetError, HvsError, OptionError, OutputError, ScenarioError
+from hvs_suite.names import check_name
 from hvs_suite.registry import find
 from hvs_suite.rollout import play
 from hvs_suite.tasks.shared.lock import digest
@@ -128,23 +129,26 @@ def record(
             workers=workers,
         )
         try:
-            with contextlib.closing(played):
-                for demonstration in in_order(played, len(outcomes)):
-                    # Not before there is something to keep: see below.
-                    if tracker.frames == 0:
-                        write_metadata(root, metadata)
-                    writer.save(demonstration)
-                    tracker.saved(demonstration.length, demonstration.success)
+            try:
+                with contextlib.closing(played):
+                    for demonstration in in_order(played, len(outcomes)):
+                        # Not before there is something to keep: see below.
+                        if tracker.frames == 0:
+                            write_metadata(root, metadata)
+                        writer.save(demonstration)
+                        tracker.saved(demonstration.length, demonstration.success)
+            except (KeyboardInterrupt, HvsError):
+                writer.publish()
+                raise
             writer.publish()
-        except KeyboardInterrupt:
-            writer.publish()
-            raise
-        except HvsError:
-            writer.publish()
-            raise
         except OSError as error:
+            if isinstance(error, HvsError):
+                raise
             writer.discard()
             saved = len(published_outcomes(root))
+            if not saved:
+                # The same command begins anew, with or without --resume.
+                (root / METADATA_FILE).unlink(missing_ok=True)
             raise OutputError(
                 f"cannot write {root}: {error.strerror or error}; {saved} of {episodes} episodes "
                 "are saved, go on with --resume"
@@ -217,6 +221,7 @@ def _check_numbers(episodes: int, split: str, noise: float, workers: int, block:
         raise OptionError(f"episodes is {episodes}; record at least 1")
     if not split.strip():
         raise ScenarioError("a split is a name such as 'train'; name one with --split")
+    check_name(split, "the split", error=ScenarioError)
     if split == TEST_SPLIT and episodes > TEST_SCENARIOS:
         raise ScenarioError(
             f"split 'test' holds {TEST_SCENARIOS} scenarios, not {episodes}; record fewer, or "
@@ -245,10 +250,10 @@ def _check_same_recording(root: Path, metadata: DatasetMetadata) -> None:
     found = read_metadata(root)
     if not found.same_recording(metadata):
         names = [
-            field.name
-            for field in dataclasses.fields(metadata)
-            if field.name not in ("command", "task_digest")
-            and getattr(found, field.name) != getattr(metadata, field.name)
+            name
+            for name in DatasetMetadata.model_fields
+            if name not in ("command", "task_digest")
+            and getattr(found, name) != getattr(metadata, name)
         ]
         raise DatasetError(
             f"{root} was recorded with another {', '.join(names) or 'meaning of the task'}; resume "

@@ -20,12 +20,13 @@ from hvs_suite.datasets.features import (
     CAMERAS,
     ERRORS,
     SCENARIO,
+    dataset_features,
     image_key,
 )
-from hvs_suite.datasets.metadata import DatasetMetadata, read_metadata
-from hvs_suite.errors import DatasetError
+from hvs_suite.datasets.metadata import METADATA_FILE, DatasetMetadata, read_metadata
+from hvs_suite.errors import DatasetError, OptionError, UnknownTaskError
 from hvs_suite.pictures import FAINT, GREEN, INK, PAPER, RED, TRACK, Picture, as_rgb, font, resize
-from hvs_suite.registry import load
+from hvs_suite.registry import find, load
 
 if TYPE_CHECKING:
     from hvs_suite.tasks.shared.spec import Spec
@@ -61,6 +62,25 @@ class Replay:
     success: bool
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Recorded:
+    """What a dataset holds of an episode of n frames.
+
+    Attributes:
+        pictures: Camera to uint8 (H, W, 3), one a frame.
+        errors: As ``ERROR_NAMES``, (n, 4).
+        actions: Executed actions, float32 (n, 7).
+        scenario: Index in the split.
+        success: It reached the goal.
+    """
+
+    pictures: dict[str, list[Picture]]
+    errors: npt.NDArray[np.float64]
+    actions: npt.NDArray[np.float32]
+    scenario: int
+    success: bool
+
+
 def replay(root: Path, episode: int) -> Replay:
     """Draws an episode of a dataset.
 
@@ -75,29 +95,12 @@ def replay(root: Path, episode: int) -> Replay:
         DatasetError: There is no such dataset or episode, or it is damaged.
     """
     metadata = read_metadata(root)
-    info = reader.read_info(root)
-    place = find_place(root, episode)
-    table = reader.read_episode(root, place)
-    if table.num_rows == 0:
-        raise DatasetError(f"{place.file} holds no frame of episode {episode}; see 'hvs check'")
-    pictures = {
-        camera: reader.read_pictures(root, place, table, image_key(camera), int(info["fps"]))
-        for camera in CAMERAS
-        if image_key(camera) in info["features"]
-    }
-    for name in (ERRORS, ACTION_EXECUTED, SCENARIO, "next.success"):
-        if name not in table.column_names:
-            raise DatasetError(f"{place.file} lacks the column {name}; see 'hvs check'")
-    errors = reader.column(table, ERRORS)
-    actions = reader.column(table, ACTION_EXECUTED).astype(np.float32)
-    scenario = int(reader.column(table, SCENARIO)[0])
-    success = bool(reader.column(table, "next.success").any())
-    if any(len(each) != len(actions) for each in pictures.values()):
-        raise DatasetError(f"{root}: episode {episode} lacks pictures; see 'hvs check'")
+    recorded = read_recorded(root, episode)
+    pictures, actions = recorded.pictures, recorded.actions
     cells: list[Picture] = []
     with load(metadata.task, split=metadata.split, **metadata.options) as env:
         variant = env.variant
-        time_step = env.reset(scenario=scenario)
+        time_step = env.reset(scenario=recorded.scenario)
         cells.append(env.render(width=CELL_SIDE, height=CELL_SIDE))
         for action in actions:
             if time_step.last():
@@ -109,9 +112,10 @@ def replay(root: Path, episode: int) -> Replay:
         at_end = [env.info["errors"][metric.name] for metric in variant.metrics]
         for camera, shown in pictures.items():
             shown.append(as_rgb(time_step.observation[camera]))
-    errors = np.vstack([errors, at_end])
+    errors = np.vstack([recorded.errors, at_end])
     head = f"{root.resolve().name}, episode {episode}"
-    tail = f"{metadata.task}, scenario {scenario} of {metadata.split}" + _noise_in_words(metadata)
+    tail = f"{metadata.task}, scenario {recorded.scenario} of {metadata.split}"
+    tail += _noise_in_words(metadata)
     frames = [
         _frame(
             variant,
@@ -119,11 +123,61 @@ def replay(root: Path, episode: int) -> Replay:
             {camera: shown[step] for camera, shown in pictures.items()},
             _curves(variant, errors, step),
             (head, tail),
-            (step, len(actions), success),
+            (step, len(actions), recorded.success),
         )
         for step in range(len(cells))
     ]
-    return Replay(frames, 1.0 / variant.control_period_s, scenario, success)
+    return Replay(frames, 1.0 / variant.control_period_s, recorded.scenario, recorded.success)
+
+
+def read_recorded(root: Path, episode: int) -> Recorded:
+    """Reads what a film shows of an episode.
+
+    Args:
+        root: The dataset.
+        episode: Its index.
+
+    Returns:
+        Its pictures and numbers, as long as each other.
+
+    Raises:
+        DatasetError: There is no such dataset or episode, or it is damaged.
+    """
+    metadata = read_metadata(root)
+    try:
+        variant = find(metadata.task).with_options(metadata.options)
+    except (UnknownTaskError, OptionError) as error:
+        raise DatasetError(f"{root}: {METADATA_FILE}: {error}") from error
+    info = reader.read_info(root)
+    place = find_place(root, episode)
+    table = reader.read_episode(root, place)
+    if table.num_rows == 0:
+        raise DatasetError(f"{place.file} holds no frame of episode {episode}; see 'hvs check'")
+    pictures = {
+        camera: reader.read_pictures(root, info, place, table, image_key(camera))
+        for camera in CAMERAS
+        if image_key(camera) in info["features"]
+    }
+    numbers = {}
+    shapes = dataset_features(variant)
+    for name in (ERRORS, ACTION_EXECUTED, SCENARIO, "next.success"):
+        with reader.in_file(root, place.file):
+            numbers[name] = reader.column(table, name)
+            shape = tuple(shapes[name]["shape"])
+            if numbers[name].shape[1:] != (() if shape == (1,) else shape):
+                raise DatasetError(f"{name} has shape {numbers[name].shape[1:]}, not {shape}")
+            if not np.isfinite(numbers[name]).all():
+                raise DatasetError(f"{name} holds NaN or infinity; see 'hvs check'")
+    actions = numbers[ACTION_EXECUTED].astype(np.float32)
+    if any(len(each) != len(actions) for each in pictures.values()):
+        raise DatasetError(f"{root}: episode {episode} lacks pictures; see 'hvs check'")
+    return Recorded(
+        pictures,
+        numbers[ERRORS].astype(np.float64),
+        actions,
+        int(numbers[SCENARIO][0]),
+        bool(numbers["next.success"].any()),
+    )
 
 
 def find_place(root: Path, episode: int) -> reader.Place:

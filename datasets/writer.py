@@ -7,7 +7,7 @@ place once it is whole, files first and counts last. What stands in place always
 
 import contextlib
 import dataclasses
-import json
+import math
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,8 +20,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hvs_suite.datasets import lerobot_files as files
+from hvs_suite.datasets import reader
 from hvs_suite.datasets.demonstration import Demonstration
 from hvs_suite.datasets.episode_stats import (
+    STAT_NAMES,
     FeatureStats,
     Shades,
     column_stats,
@@ -284,29 +286,40 @@ def _read_published(root: Path, features: Mapping[str, dict[str, Any]]) -> _Publ
     if not (root / files.INFO).exists():
         return _Published()
     (episodes, frames), listed = _counts(root), _episode_files(root)
-    last = pq.read_table(listed[-1], columns=[*_DATA_PLACE, *_EPISODE_PLACE]).to_pylist()[-1]
+    if not listed:
+        raise reader.DamagedFileError(files.EPISODES, "is missing; record the dataset again")
+    last = reader.read_numbers(root, listed[-1], [*_DATA_PLACE, *_EPISODE_PLACE])
     data_file, episode_file = (
-        last[chunk] * files.FILES_A_CHUNK + last[file]
+        int(last[chunk][-1]) * files.FILES_A_CHUNK + int(last[file][-1])
         for chunk, file in (_DATA_PLACE, _EPISODE_PLACE)
     )
     names = files.with_counters(features)
+    stats = reader.read_stats(root)
     try:
-        stats = _read_json(root / files.STATS)
         # A kill between the last two files leaves statistics that count a block too many.
         if stats["index"]["count"] == [frames]:
             whole = {name: FeatureStats.from_named(stats[name]) for name in names}
         else:
-            whole = _stats_of_episodes(listed, list(names))
-    except (KeyError, TypeError, ValueError) as error:
-        raise _damaged(root / files.STATS, error) from None
+            whole = _stats_of_episodes(root, listed, list(names))
+        for name, feature in names.items():
+            width = (
+                feature["shape"][-1] if files.is_picture(feature) else math.prod(feature["shape"])
+            )
+            if whole[name].values.shape != (len(STAT_NAMES), width):
+                raise ValueError(f"{name} has another size")
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+        if isinstance(error, DatasetError):
+            raise
+        what = f"is damaged ({type(error).__name__}: {error}); record the dataset again"
+        raise reader.DamagedFileError(files.STATS, what) from None
     return _Published(episodes, frames, data_file + 1, episode_file + 1, whole)
 
 
-def _stats_of_episodes(listed: list[Path], names: list[str]) -> dict[str, FeatureStats]:
+def _stats_of_episodes(root: Path, listed: list[str], names: list[str]) -> dict[str, FeatureStats]:
     """Statistics of all episodes that are listed, merged."""
     parts: dict[str, list[FeatureStats]] = {name: [] for name in names}
     for path in listed:
-        for row in pq.read_table(path).to_pylist():
+        for row in reader.read_table(root, path).to_pylist():
             for name in names:
                 prefix = f"{files.STATS_PREFIX}{name}/"
                 named = {k.removeprefix(prefix): v for k, v in row.items() if k.startswith(prefix)}
@@ -355,11 +368,12 @@ def published_outcomes(root: Path) -> list[bool]:
         return []
     outcomes: dict[int, bool] = {}
     for path in sorted((root / "data").glob("*/*.parquet")):
-        table = pq.read_table(path, columns=["episode_index", "next.success"]).to_pydict()
-        for episode, success in zip(table["episode_index"], table["next.success"], strict=True):
-            outcomes[episode] = outcomes.get(episode, False) or bool(success)
+        name = path.relative_to(root).as_posix()
+        rows = reader.read_numbers(root, name, ["episode_index", "next.success"])
+        for episode, success in zip(rows["episode_index"], rows["next.success"], strict=True):
+            outcomes[int(episode)] = outcomes.get(int(episode), False) or bool(success)
     count, _ = _counts(root)
-    if sorted(outcomes) != list(range(count)):
+    if len(outcomes) != count or sorted(outcomes) != list(range(count)):
         raise DatasetError(f"{root} counts {count} episodes but holds others; record it again")
     return [outcomes[episode] for episode in range(count)]
 
@@ -370,32 +384,14 @@ def _counts(root: Path) -> tuple[int, int]:
     Raises:
         DatasetError: ``info.json`` is damaged.
     """
-    info = _read_json(root / files.INFO)
-    try:
-        return int(info["total_episodes"]), int(info["total_frames"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise _damaged(root / files.INFO, error) from None
+    info = reader.read_info(root)
+    return info["total_episodes"], info["total_frames"]
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    """Reads a file of ``meta``.
-
-    Raises:
-        DatasetError: It is damaged.
-    """
-    try:
-        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise _damaged(path, error) from None
-    return content
-
-
-def _damaged(path: Path, error: Exception) -> DatasetError:
-    return DatasetError(f"{path} is damaged ({error}); record the dataset again")
-
-
-def _episode_files(root: Path) -> list[Path]:
-    return sorted((root / files.EPISODES).glob("*/*.parquet"))
+def _episode_files(root: Path) -> list[str]:
+    """Files of ``meta/episodes``, relative to the dataset."""
+    found = sorted((root / files.EPISODES).glob("*/*.parquet"))
+    return [path.relative_to(root).as_posix() for path in found]
 
 
 def _drop_unpublished(root: Path) -> None:
@@ -405,16 +401,14 @@ def _drop_unpublished(root: Path) -> None:
         shutil.rmtree(root / "meta", ignore_errors=True)
         return
     count, _ = _counts(root)
-    kept: set[tuple[int, int]] = set()
-    for path in _episode_files(root):
-        rows = pq.read_table(path, columns=["episode_index", *_DATA_PLACE]).to_pydict()
-        if min(rows["episode_index"]) >= count:
-            path.unlink()
-        else:
-            kept |= set(zip(*(rows[name] for name in _DATA_PLACE), strict=True))
-    wanted = {
-        root / "data" / f"chunk-{chunk:03d}" / f"file-{file:03d}.parquet" for chunk, file in kept
-    }
+    places = reader.read_places(root)
+    kept = [place for place in places if place.episode < count]
+    wanted = {place.file for place in kept}
+    if lacking := sorted(name for name in wanted if not (root / name).is_file()):
+        # Another list than that of these files: none of them is known to be superfluous.
+        raise reader.DamagedFileError(lacking[0], "is missing; record the dataset again")
+    for name in {place.listed_in for place in places} - {place.listed_in for place in kept}:
+        (root / name).unlink()
     for path in (root / "data").glob("*/*.parquet"):
-        if path not in wanted:
+        if path.relative_to(root).as_posix() not in wanted:
             path.unlink()

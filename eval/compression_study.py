@@ -170,7 +170,7 @@ class _Original:
         self.episodes = len(self.places)
         self.frames = sum(place.length for place in self.places)
         self.sides: dict[str, int] = {}
-        self._fps = int(info["fps"])
+        self._info = info
         for camera in CAMERAS:
             feature = info["features"].get(image_key(camera))
             if feature is not None and feature["dtype"] != "image":
@@ -184,7 +184,7 @@ class _Original:
     def pictures(self, place: reader.Place, camera: str) -> list[Picture]:
         """An episode's lossless pictures, uint8 (H, W, 3) each."""
         table = reader.read_episode(self.root, place)
-        return reader.read_pictures(self.root, place, table, image_key(camera), self._fps)
+        return reader.read_pictures(self.root, self._info, place, table, image_key(camera))
 
     def figures(self, folder: Path, report: Report) -> dict[str, CameraFigures]:
         """Size and localisation of the lossless pictures; the others are held against these."""

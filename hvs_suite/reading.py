@@ -10,11 +10,12 @@ import json
 import math
 import os
 import stat
+import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,12 +23,25 @@ import pydantic
 
 from hvs_suite.errors import HvsError
 
+if TYPE_CHECKING:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
 MOST_JSON_BYTES = 64 * 2**20
 """Larger than any JSON file of ours: a result of 1,000 scenarios takes 1 MB."""
 # Far deeper than any file of ours; Python's parser itself gives up at about a thousand.
 _MOST_JSON_DEPTH = 64
 _NPZ_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _ENCRYPTED = 0x1
+MOST_PARQUET_BYTES = 2 * 2**30
+"""Of a parquet file, packed and unpacked: LeRobot begins a new one at 100 MB."""
+# An Arrow value is 8 bytes at most, but for bytes, which count as what they unpack to.
+_ARROW_BYTES = 8
+# Magic and the header's own first bytes, then width, height, bits a channel and kind of colour.
+_PNG_HEADER = struct.Struct(">16sIIBB")
+_PNG_MAGIC = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR"
+_PNG_DEPTH = 8
+_PNG_CHANNELS = {0: 1, 2: 3}
 
 
 def check_regular(
@@ -48,11 +62,12 @@ def check_regular(
         HvsError: As `error`: it is missing, a folder, a FIFO, a device, outside, or too large.
     """
     try:
-        if within is not None and not path.resolve().is_relative_to(within.resolve()):
-            raise error(f"{path}: leads out of {within}; only files inside it are read")
+        inside = within is None or path.resolve().is_relative_to(within.resolve())
         found = path.stat()
     except (OSError, ValueError, RuntimeError) as reason:
         raise error(f"{path}: cannot be read ({_why(reason)})") from reason
+    if not inside:
+        raise error(f"{path}: leads out of {within}; only files inside it are read")
     if not stat.S_ISREG(found.st_mode):
         kind = "a folder" if stat.S_ISDIR(found.st_mode) else "no regular file"
         raise error(f"{path}: is {kind}; a file is expected")
@@ -265,3 +280,108 @@ def _names(names: Mapping[str, object]) -> str:
 def _why(reason: BaseException) -> str:
     text = getattr(reason, "strerror", None) or str(reason) or type(reason).__name__
     return str(text).splitlines()[0][:200]
+
+
+def decode_png(
+    content: object, shape: tuple[int, int, int], *, error: type[HvsError]
+) -> npt.NDArray[np.uint8]:
+    """Decode a PNG whose header says that it is what it should be.
+
+    Args:
+        content: The file's bytes; anything else is refused as no picture.
+        shape: (H, W, C) that it must have, with C 3 for RGB and 1 for grey.
+        error: Raised where it is no such picture.
+
+    Returns:
+        uint8 (H, W, C).
+
+    Raises:
+        HvsError: As `error`: nothing, no PNG, of another size or kind, or damaged. Nothing is
+            unpacked of a picture of another size.
+    """
+    if not isinstance(content, bytes) or not content:
+        raise error("holds no image")
+    if len(content) < _PNG_HEADER.size:
+        raise error(f"cannot be decoded ({len(content)} bytes are no PNG)")
+    magic, width, height, depth, colour = _PNG_HEADER.unpack_from(content)
+    if magic != _PNG_MAGIC:
+        raise error("cannot be decoded (it is no PNG)")
+    if depth != _PNG_DEPTH or colour not in _PNG_CHANNELS:
+        raise error(f"is a PNG of {depth} bits and colour type {colour}, not 8-bit RGB or grey")
+    if (height, width, _PNG_CHANNELS[colour]) != tuple(shape):
+        raise error(f"has shape {(height, width, _PNG_CHANNELS[colour])}, not {tuple(shape)}")
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(content), formats=("PNG",)) as image:
+            return np.asarray(image).reshape(shape)
+    except (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error) as reason:
+        raise error(f"cannot be decoded ({_why(reason)})") from reason
+
+
+def read_parquet(
+    path: Path,
+    columns: Sequence[str] | None = None,
+    *,
+    error: type[HvsError],
+    within: Path | None = None,
+) -> "pa.Table":
+    """Read a parquet file that says of itself that it unpacks to no more than it may.
+
+    Strings and bytes stay dictionaries where they are: a file of a few bytes can name one long
+    value for each of a million rows.
+
+    Args:
+        path: The file.
+        columns: Columns to read; all by default.
+        error: Raised where it cannot be read.
+        within: As in `check_regular`.
+
+    Returns:
+        The columns in the order of the file.
+
+    Raises:
+        HvsError: As `error`: not parquet, damaged, too large, a column missing or named twice.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    check_regular(path, error=error, within=within, most=MOST_PARQUET_BYTES)
+    try:
+        with pq.ParquetFile(path) as file:
+            chosen = _choose_columns(path, file, columns, error)
+        with pq.ParquetFile(path, read_dictionary=chosen) as file:
+            return file.read(columns)
+    except (pa.ArrowException, OSError, ValueError, LookupError, MemoryError) as reason:
+        if isinstance(reason, HvsError):
+            raise
+        raise error(f"{path}: cannot be read ({_why(reason)})") from reason
+
+
+def _choose_columns(
+    path: Path, file: "pq.ParquetFile", columns: Sequence[str] | None, error: type[HvsError]
+) -> list[str]:
+    """Check what the footer says of the columns to be read; the leaves of bytes among them."""
+    names = file.schema_arrow.names
+    wanted = names if columns is None else columns
+    lacking = sorted(set(wanted) - set(names))
+    if lacking:
+        raise error(f"{path}: lacks the columns {', '.join(lacking)}")
+    if len(set(names)) != len(names):
+        raise error(f"{path}: names a column twice")
+    leaves = [
+        (leaf, index)
+        for index in range(len(file.schema))
+        for leaf in [file.schema.column(index)]
+        if any(leaf.path == name or leaf.path.startswith(f"{name}.") for name in wanted)
+    ]
+    unpacked = 0
+    for group in map(file.metadata.row_group, range(file.metadata.num_row_groups)):
+        for _, index in leaves:
+            chunk = group.column(index)
+            # A run of a billion values that are alike, or missing, takes but a few bytes.
+            least = _ARROW_BYTES * max(chunk.num_values, group.num_rows)
+            unpacked += max(chunk.total_uncompressed_size, least)
+    if unpacked > MOST_PARQUET_BYTES:
+        raise error(f"{path}: would unpack to more than {MOST_PARQUET_BYTES:,} bytes")
+    return [leaf.path for leaf, _ in leaves if leaf.physical_type == "BYTE_ARRAY"]

@@ -5,20 +5,19 @@ package, which takes longer than opening a small dataset.
 """
 
 import dataclasses
-import json
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
-from hvs_suite.datasets.features import ACTION, ACTION_EXECUTED
+from hvs_suite.datasets import reader
+from hvs_suite.datasets.features import ACTION, ACTION_EXECUTED, dataset_features
 from hvs_suite.datasets.metadata import read_metadata
-from hvs_suite.errors import DatasetError, OptionError
+from hvs_suite.errors import DatasetError, OptionError, UnknownTaskError
 from hvs_suite.policies.frame_cache import (
     Frames,
     OnFrames,
@@ -29,6 +28,8 @@ from hvs_suite.policies.frame_cache import (
 from hvs_suite.policies.hvs.geometry import Calibration, calibrate
 from hvs_suite.policies.hvs.network import IMAGE_PREFIX, MEMORY, N_JOINTS, STATE
 from hvs_suite.policies.remembered import remembered
+from hvs_suite.registry import find
+from hvs_suite.tasks.shared.placing import PlacingSpec
 
 EPISODE = "episode_index"
 GOAL_POSITION = "privileged.goal_position"
@@ -86,7 +87,7 @@ class Manifest:
             key.removeprefix(IMAGE_PREFIX): (shape[0], shape[1], shape[2])
             for key, feature in sorted(self.features.items())
             if key.startswith(IMAGE_PREFIX)
-            for shape in [tuple(feature["shape"])]
+            for shape in [feature["shape"]]
         }
 
     @property
@@ -128,20 +129,32 @@ def read_manifest(root: Path) -> Manifest:
     Raises:
         DatasetError: There is no such dataset, it is empty, or it was not recorded by this suite.
     """
-    info = _read_json(root / "meta" / "info.json", f"{root} is not a LeRobot dataset")
-    origin = read_metadata(root)
     try:
-        manifest = Manifest(
-            root=root,
-            task=origin.task,
-            split=origin.split,
-            options=origin.options,
-            features=info["features"],
-            n_frames=int(info["total_frames"]),
-            n_episodes=int(info["total_episodes"]),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise DatasetError(f"{root}: meta/info.json lacks {error}") from error
+        info = reader.read_info(root)
+    except DatasetError as error:
+        raise DatasetError(f"{root} is not a LeRobot dataset: {error}") from error
+    origin = read_metadata(root)
+    manifest = Manifest(
+        root=root,
+        task=origin.task,
+        split=origin.split,
+        options=origin.options,
+        features=info["features"],
+        n_frames=info["total_frames"],
+        n_episodes=info["total_episodes"],
+    )
+    try:
+        wanted = dataset_features(find(origin.task).with_options(origin.options))
+    except (UnknownTaskError, OptionError) as error:
+        raise DatasetError(f"{root}: hvs.json: {error}") from error
+    for key in manifest.trained_keys:
+        found = list(manifest.features[key]["shape"])
+        # Pictures may be smaller than the task's; their size is held against the files.
+        if key.startswith(IMAGE_PREFIX):
+            continue
+        right = list(wanted[key]["shape"]) if key in wanted else "recorded on this task"
+        if found != right:
+            raise DatasetError(f"{root}: meta/info.json: {key} has shape {found}, not {right}")
     if manifest.n_frames == 0:
         raise DatasetError(f"{root} is empty; record at least two episodes")
     return manifest
@@ -343,11 +356,13 @@ def _calibrate(
 
 
 def _standoff(manifest: Manifest) -> float:
-    from hvs_suite.registry import TASKS
-
-    if manifest.task not in TASKS:
-        raise DatasetError(f"{manifest.root} was recorded on {manifest.task}, an unknown task")
-    return float(manifest.options.get("standoff_m", TASKS[manifest.task].standoff_m))
+    spec = find(manifest.task).with_options(manifest.options)
+    if not isinstance(spec, PlacingSpec):
+        raise DatasetError(
+            f"{manifest.root} was recorded on {manifest.task}; this policy knows targets on a level "
+            "surface alone"
+        )
+    return spec.standoff_m
 
 
 def _read_columns(manifest: Manifest) -> dict[str, Column]:
@@ -361,16 +376,19 @@ def _read_columns(manifest: Manifest) -> dict[str, Column]:
         raise DatasetError(f"{manifest.root} needs an action and at least one camera to learn from")
     parts: dict[str, list[Column]] = {key: [] for key in [*keys, EPISODE]}
     for path in data_files(manifest.root):
-        try:
-            table = pq.read_table(path, columns=[*keys, EPISODE])
-        except (OSError, ValueError) as error:
-            raise DatasetError(f"{path} cannot be read: {error}") from error
-        for key in keys:
-            column = table.column(key).combine_chunks()
-            width = int(manifest.features[key]["shape"][0])
-            flat = column.flatten().to_numpy(zero_copy_only=False)
-            parts[key].append(flat.reshape(-1, width).astype(np.float32))
-        parts[EPISODE].append(table.column(EPISODE).to_numpy().astype(np.int64))
+        name = path.relative_to(manifest.root).as_posix()
+        table = reader.read_table(manifest.root, name, [*keys, EPISODE])
+        with reader.in_file(manifest.root, name):
+            for key in keys:
+                values = reader.column(table, key)
+                declared = tuple(manifest.features[key]["shape"])
+                if values.shape[1:] != declared:
+                    raise DatasetError(f"{key} has shape {values.shape[1:]}, not {declared}")
+                parts[key].append(values.astype(np.float32))
+            index = reader.column(table, EPISODE)
+            if index.ndim != 1:
+                raise DatasetError(f"{EPISODE}: a row holds no number")
+            parts[EPISODE].append(index.astype(np.int64))
     columns = {key: np.concatenate(arrays) for key, arrays in parts.items()}
     if len(columns[EPISODE]) != manifest.n_frames:
         raise DatasetError(
@@ -378,12 +396,3 @@ def _read_columns(manifest: Manifest) -> dict[str, Column]:
             f"{len(columns[EPISODE])}; record it again"
         )
     return columns
-
-
-def _read_json(path: Path, otherwise: str) -> dict[str, Any]:
-    try:
-        return dict(json.loads(path.read_text()))
-    except OSError as error:
-        raise DatasetError(f"{otherwise}: no readable {path.name}") from error
-    except ValueError as error:
-        raise DatasetError(f"{otherwise}: {path.name} is not JSON") from error

@@ -8,15 +8,14 @@ import contextlib
 import hashlib
 import json
 import mmap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
-import pyarrow.parquet as pq
 
+from hvs_suite.datasets import reader
 from hvs_suite.errors import DatasetError
 from hvs_suite.files import replacing
 
@@ -55,7 +54,7 @@ def fingerprint(root: Path) -> str:
 def cached_frames(
     root: Path,
     key: str,
-    shape: Sequence[int],
+    shape: tuple[int, int, int],
     n_frames: int,
     folder: Path,
     on_frames: OnFrames | None = None,
@@ -88,10 +87,13 @@ def cached_frames(
     open_memmap: Any = np.lib.format.open_memmap  # untyped in NumPy's stubs
     frames = open_memmap(path, mode="w+", dtype=np.uint8, shape=(n_frames, *shape))
     done = 0
-    for encoded in _encoded(root, key):
+    for stored in _stored(root, key):
         if done >= n_frames:
             raise DatasetError(f"{root} holds more than the {n_frames} frames that it declares")
-        frames[done] = _decode(encoded, tuple(shape), f"frame {done} of {key}")
+        try:
+            frames[done] = reader.decode(stored, shape)
+        except DatasetError as error:
+            raise DatasetError(f"{root}: frame {done}: {key} {error}; see 'hvs check'") from None
         done += 1
         if on_frames is not None and done % ROWS_AT_ONCE == 0:
             on_frames(ROWS_AT_ONCE)
@@ -151,21 +153,9 @@ def read_rows(frames: Frames, rows: npt.NDArray[np.int64], out: Frames) -> None:
     np.take(frames, rows, axis=0, out=out, mode="clip")
 
 
-def _encoded(root: Path, key: str) -> Iterator[bytes]:
+def _stored(root: Path, key: str) -> Iterator[Any]:
+    """The images of a camera as parquet holds them."""
     for path in data_files(root):
-        for batch in pq.ParquetFile(path).iter_batches(ROWS_AT_ONCE, columns=[key]):
-            for cell in batch.column(0).to_pylist():
-                content = cell["bytes"]
-                yield content if content is not None else (root / cell["path"]).read_bytes()
-
-
-def _decode(encoded: bytes, shape: tuple[int, ...], what: str) -> Frames:
-    grey = shape[2] == 1
-    flag = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR
-    image = cv2.imdecode(np.frombuffer(encoded, np.uint8), flag)
-    if image is None:
-        raise DatasetError(f"{what} cannot be decoded; check the dataset with hvs check")
-    image = image[..., None] if grey else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-    if image.shape != shape:
-        raise DatasetError(f"{what} is {image.shape}, not {shape} as the dataset declares")
-    return np.asarray(image, np.uint8)
+        table = reader.read_table(root, path.relative_to(root).as_posix(), [key])
+        for stored in table.column(key):
+            yield stored.as_py()

@@ -26,8 +26,6 @@ class Fetch:
     def run(self) -> None:
         """Unpack, and say what came."""
         from hvs_suite.datasets.archive import unpack
-        from hvs_suite.datasets.metadata import read_metadata
 
-        count = unpack(self.archive, self.out, self.sha256)
-        metadata = read_metadata(self.out)
+        count, metadata = unpack(self.archive, self.out, self.sha256)
         print(f"{self.out}: {count} files of {metadata.task}, checksums match")

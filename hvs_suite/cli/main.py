@@ -99,7 +99,7 @@ def _quieten_libraries() -> None:
 
 
 def complain(reason: str) -> None:
-    """Print one line to stderr, whatever line breaks the reason holds."""
+    """Print one line to stderr, whatever line breaks and escape sequences the reason holds."""
     print(f"hvs: {shown(' '.join(reason.split()))}", file=sys.stderr)
 
 

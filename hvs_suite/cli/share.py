@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import re
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +12,9 @@ import tyro
 
 from hvs_suite.cli import console
 from hvs_suite.errors import DatasetError, OptionError
+
+# As the Hub writes them; it stands in the card's front matter.
+_LICENCE = re.compile(r"[A-Za-z0-9][A-Za-z0-9.+-]{0,63}")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -58,6 +62,8 @@ class Share:
             check_writable(self.to_archive)
         if self.to_hub is not None:
             publication.check_repository(self.to_hub)
+        if not _LICENCE.fullmatch(self.licence):
+            raise OptionError(f"{self.licence!r} names no licence; write one such as apache-2.0")
         if not 0 <= self.crf <= 63:
             raise OptionError(f"crf is {self.crf}; use 0 (best) to 63")
         self._refuse_damage(self.data)

@@ -158,7 +158,7 @@ DAMAGE = {
     ),
     "no JSON": (
         lambda root: (root / "meta/info.json").write_text("{"),
-        "meta/info.json", None, None, "damaged",
+        "meta/info.json", None, None, "is not JSON",
     ),
     "another split": (
         of_json("hvs.json", lambda origin: origin.update(split="test")), DATA, 0, 0, "privileged",

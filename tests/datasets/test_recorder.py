@@ -218,6 +218,7 @@ def test_a_folder_that_may_not_be_written_is_one_clear_line(tmp_path, monkeypatc
         ({"episodes": 0}, OptionError),
         ({"episodes": 1001, "split": "test"}, ScenarioError),
         ({"split": " "}, ScenarioError),
+        ({"split": "train\n\x1b[31m"}, ScenarioError),
         ({"noise": -0.1}, OptionError),
         ({"noise": float("nan")}, OptionError),
         ({"workers": 0}, OptionError),
@@ -233,11 +234,25 @@ def test_nonsense_is_refused_before_anything_is_written(change, error, tmp_path)
     assert not (tmp_path / "new").exists()
 
 
+def test_a_resumed_recording_drops_nothing_that_another_list_leaves_out(dataset, tmp_path):
+    root = tmp_path / "relisted"
+    shutil.copytree(dataset, root)
+    listed = root / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    table = pq.read_table(listed)
+    index = table.schema.get_field_index("data/file_index")
+    moved = table.set_column(index, "data/file_index", [[7] * table.num_rows])
+    pq.write_table(moved, listed)
+    before = sorted(root.rglob("*"))
+    with pytest.raises(DatasetError, match="file-007"):
+        record(TASK, N + 1, "train", root, resume=True)
+    assert sorted(root.rglob("*")) == before
+
+
 def test_metadata_of_anything_else_is_refused(tmp_path):
     with pytest.raises(DatasetError, match=r"hvs\.json"):
         read_metadata(tmp_path)
     (tmp_path / "hvs.json").write_text("{")
-    with pytest.raises(DatasetError, match="damaged"):
+    with pytest.raises(DatasetError, match="is not JSON"):
         read_metadata(tmp_path)
     (tmp_path / "hvs.json").write_text('{"format": 99}')
     with pytest.raises(DatasetError, match="format"):

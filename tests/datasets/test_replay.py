@@ -9,7 +9,7 @@ import pytest
 
 from hvs_suite.cli.main import run
 from hvs_suite.datasets import replay as film
-from hvs_suite.datasets.reader import decode
+from hvs_suite.datasets.reader import decode, read_info, shape_of
 from hvs_suite.pictures import resize
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "align-thesis"
@@ -39,7 +39,8 @@ def test_shows_the_pictures_of_the_dataset(played):
     side = film.CAMERA_SIDE
     for step in (0, 4):
         shown = played.frames[step][top : top + side, left : left + side]
-        stored = decode(rows()[step]["observation.images.eth"])
+        key = "observation.images.eth"
+        stored = decode(rows()[step][key], shape_of(read_info(SAMPLE), key))
         np.testing.assert_array_equal(shown, resize(stored, side))
 
 

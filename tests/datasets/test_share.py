@@ -104,6 +104,43 @@ def test_commands_share_and_fetch(copy, tmp_path, capsys):
     assert not (tmp_path / "new").exists()
 
 
+def test_a_card_shows_what_a_stranger_wrote_and_does_not_obey_it(copy):
+    import json
+
+    origin = json.loads((copy / "hvs.json").read_text())
+    origin |= {
+        "split": "tr`|ain",
+        "command": "hvs record\n```\n# <script>\x1b[31m\u202e",
+        "options": {"standoff_m": 0.2},
+    }
+    (copy / "hvs.json").write_text(json.dumps(origin))
+    text = write_card(copy)
+    [fenced] = [line for line in text.splitlines() if "<script>" in line]
+    assert all(character.isprintable() for character in fenced)
+    assert "````sh" in text
+    assert "| split and scenarios | `tr'\\|ain`, 0 to 4 |" in text
+    assert "| options | `standoff_m=0.2` |" in text
+
+
+@pytest.mark.parametrize("name", ["a\nb", "a\x1b[2J", "a\u202eb", "a/\u200b", "a//b", "./a"])
+def test_an_archive_with_a_name_that_misleads_is_refused(name, tmp_path):
+    archive = tar_of(tmp_path / "bad.tar", [(name, b"x")])
+    with pytest.raises(DatasetError) as refused:
+        unpack(archive, tmp_path / "out")
+    assert str(refused.value).isprintable()
+    assert [p.name for p in tmp_path.iterdir()] == ["bad.tar"]
+
+
+def test_an_archive_of_no_dataset_is_refused_and_leaves_nothing(tmp_path):
+    for number, content in enumerate([b"{", b"[1]", b'{"format": 1, "task": "a\\nb"}']):
+        archive = tar_of(tmp_path / f"{number}.tar", [("hvs.json", content)])
+        with pytest.raises(DatasetError, match=archive.name):
+            unpack(archive, tmp_path / "out")
+        assert not (tmp_path / "out").exists()
+        archive.unlink()
+    assert list(tmp_path.iterdir()) == []
+
+
 def link(name, target, kind):
     info = tarfile.TarInfo(name)
     info.type, info.linkname = kind, target
@@ -182,6 +219,9 @@ def test_a_dataset_with_links_is_not_packed(copy, tmp_path):
         (["{copy}", "--to-archive", "{folder}/a.zip"], ".tar"),
         (["{copy}", "--to-hub", "name"], "user/name"),
         (["{copy}", "--to-archive", "{folder}/a.tar", "--crf", "99"], "crf"),
+        (["{copy}", "--to-archive", "{folder}/a.tar", "--licence", "x\ny: z"], "no licence"),
+        (["{copy}", "--to-hub", "us\u200fer/name"], "user/name"),
+        (["{copy}", "--to-hub", "user/na\nme"], "user/name"),
         (["{folder}/none", "--to-archive", "{folder}/a.tar"], "no dataset"),
         (["{damaged}", "--to-archive", "{folder}/a.tar"], "cannot be read"),
     ],

@@ -259,7 +259,7 @@ def test_damaged_statistics_are_named_on_resume(features, episodes, tmp_path):
     root = tmp_path / "damaged"
     write(root, features, episodes[:1], 1)
     (root / lerobot_files.STATS).write_text("{")
-    with pytest.raises(DatasetError, match=r"stats\.json is damaged"):
+    with pytest.raises(DatasetError, match=r"stats\.json: is not JSON"):
         write(root, features, episodes[1:2], 1)
 
 

@@ -47,10 +47,10 @@ def copy(studied: tuple[Path, Study]) -> VideoCopy:
 
 
 def test_frames_come_back_all_and_in_order(copy: VideoCopy) -> None:
-    seen = 0
+    seen, info = 0, reader.read_info(SAMPLE)
     for place, table, pictures in copy.episodes():
         for key in (EIH, ETH):
-            before = np.array(reader.read_pictures(SAMPLE, place, table, key, 10), np.float32)
+            before = np.array(reader.read_pictures(SAMPLE, info, place, table, key), np.float32)
             after = np.array(pictures[key], np.float32)
             assert after.shape == before.shape
             distance = np.abs(after[:, None] - before[None]).mean(axis=(2, 3, 4))
@@ -165,7 +165,7 @@ def test_decoded_frames_are_a_dataset_with_the_same_numbers(
         old, new = reader.read_episode(SAMPLE, before), reader.read_episode(out, after)
         assert old.drop_columns([EIH, ETH]) == new.drop_columns([EIH, ETH])
         for key in (EIH, ETH):
-            stored = reader.read_pictures(out, after, new, key, 10)
+            stored = reader.read_pictures(out, reader.read_info(out), after, new, key)
             np.testing.assert_array_equal(stored, pictures[key])
 
 
