@@ -116,7 +116,7 @@ def describe(
         contents: What it holds.
         licence: Identifier of its licence.
     """
-    variant = find(metadata.task).with_options(metadata.options)
+    spec = find(metadata.task).with_options(metadata.options)
     share = 100.0 * contents.successes / max(1, contents.episodes)
     options = ", ".join(_code(f"{k}={v!r}") for k, v in sorted(metadata.options.items()))
     noise = (
@@ -129,7 +129,7 @@ def describe(
         "task": f"`{metadata.task}`, version {metadata.task_version}",
         "task digest": f"`{metadata.task_digest or digest(metadata.task)}`",
         "options": options or "as named",
-        "instruction": variant.instruction(),
+        "instruction": spec.instruction(),
         "robot": f"KUKA LBR iiwa 7 R800, {JOINT_NAMES[0]} to {JOINT_NAMES[-1]}, simulated (MuJoCo)",
         "split and scenarios": f"{_code(metadata.split)}, {contents.scenarios[0]} to "
         f"{contents.scenarios[1]}",
@@ -152,7 +152,7 @@ def describe(
         "",
         f"![Camera pictures of the first episode, from start to goal]({PICTURE})",
         "",
-        f"{_tolerance(variant)} Recorded with hvs_suite in LeRobot's format "
+        f"{_tolerance(spec)} Recorded with hvs_suite in LeRobot's format "
         f"{info.get('codebase_version', 'v3.0')}.",
         "",
         "| | |",
@@ -245,19 +245,11 @@ def _code(text: str) -> str:
     return f"`{plain}`"
 
 
-def _tolerance(variant: Spec) -> str:
-    """What counts as success, in a sentence."""
-    if variant.position_tolerance_mm is not None:
-        length = f"{variant.position_tolerance_mm:g} mm"
-    else:
-        length = (
-            f"{variant.lateral_tolerance_mm:g} mm sideways and "
-            f"{variant.height_tolerance_mm:g} mm in height"
-        )
-    held = f", held for {variant.hold_steps} steps" if variant.hold_steps > 1 else ""
+def _tolerance(spec: Spec) -> str:
+    """What has to be done, in two sentences."""
+    words = spec.describe()
+    held = f", held for {words.held}" if words.held else ""
     return (
-        f"The arm brings its flange {variant.standoff_m * 1000:.0f} mm above a "
-        f"{variant.target_diameter_m * 1000:.0f} mm {variant.marker}, facing it: within {length} "
-        f"and {variant.tilt_tolerance_deg:g} deg{held}, in at most {variant.time_limit_steps} "
-        f"steps of {variant.control_period_s:g} s."
+        f"{spec.instruction()} Target: {words.target}; within {words.tolerance}{held}, in at most "
+        f"{spec.time_limit_steps} steps of {spec.control_period_s:g} s."
     )

@@ -114,19 +114,19 @@ def check_dataset(
         raise DatasetError(f"{root} holds no dataset; name the root of one made by 'hvs record'")
     try:
         metadata = read_metadata(root)
-        variant = find(metadata.task).with_options(metadata.options)
-        features = dataset_features(variant)
+        spec = find(metadata.task).with_options(metadata.options)
+        features = dataset_features(spec)
     except HvsError as error:
         return Report(0, 0, (Damage(METADATA_FILE, None, None, str(error)),))
-    _check_same_task(root, metadata, variant)
+    _check_same_task(root, metadata, spec)
     damage: list[Damage] = []
     try:
         info = reader.read_info(root)
         places = reader.read_places(root)
     except DamagedFileError as error:
         return Report(0, 0, (Damage.of(error),))
-    damage += _check_info(info, features, variant, places)
-    damage += _check_sentence(root, variant)
+    damage += _check_info(info, features, spec, places)
+    damage += _check_sentence(root, spec)
     damage += _check_order(places)
     damage += _check_videos(info, places)
     unreadable, in_files = _check_files(root, places)
@@ -387,14 +387,14 @@ def _no_policy(env: Any) -> Any:
     return None
 
 
-def _check_same_task(root: Path, metadata: DatasetMetadata, variant: Spec) -> None:
+def _check_same_task(root: Path, metadata: DatasetMetadata, spec: Spec) -> None:
     """Refuses a dataset of another meaning of the task: nothing could be reproduced.
 
     Raises:
         DatasetError: It was recorded with another version, or the name meant something else.
     """
-    now = f"{variant.name}-v{variant.version}"
-    if metadata.task_version != variant.version or metadata.task_digest not in (
+    now = f"{spec.name}-v{spec.version}"
+    if metadata.task_version != spec.version or metadata.task_digest not in (
         "",
         digest(metadata.task),
     ):
@@ -408,7 +408,7 @@ def _check_same_task(root: Path, metadata: DatasetMetadata, variant: Spec) -> No
 def _check_info(
     info: Mapping[str, Any],
     features: Mapping[str, Mapping[str, Any]],
-    variant: Spec,
+    spec: Spec,
     places: Iterable[Place],
 ) -> list[Damage]:
     """Names, shapes, types and counts of ``meta/info.json``."""
@@ -430,7 +430,7 @@ def _check_info(
     if extra:
         wrong.append(f"has features of no recording: {', '.join(extra)}")
     expected = {
-        "fps": round(1.0 / variant.control_period_s),
+        "fps": round(1.0 / spec.control_period_s),
         "robot_type": ROBOT_TYPE,
         "total_episodes": len(list(places)),
     }
@@ -440,12 +440,12 @@ def _check_info(
     return [Damage(reader.INFO, None, None, what) for what in wrong]
 
 
-def _check_sentence(root: Path, variant: Spec) -> list[Damage]:
+def _check_sentence(root: Path, spec: Spec) -> list[Damage]:
     try:
         sentences = reader.read_sentences(root)
     except DamagedFileError as error:
         return [Damage.of(error)]
-    if sentences != [variant.instruction()]:
+    if sentences != [spec.instruction()]:
         return [Damage(reader.TASKS, None, None, f"{sentences} is not the task's sentence")]
     return []
 

@@ -113,7 +113,7 @@ class Demonstrate:
         frames: list[Frame] = []
         moments: list[Moment] = []
         while not time_step.last():
-            frame = observed_part(env.variant, time_step.observation, env)
+            frame = observed_part(env.spec, time_step.observation, env)
             moments.append(env.moment())
             action = expert.select_action(time_step.observation)
             executed = action if perturbation is None else perturbation.apply(action)
@@ -129,7 +129,7 @@ class Demonstrate:
         for camera, drawn in env.pictures(moments).items():
             for frame, picture in zip(frames, drawn, strict=True):
                 frame[image_key(camera)] = picture
-        return packed(scenario, frames, dataset_features(env.variant), env.info)
+        return packed(scenario, frames, dataset_features(env.spec), env.info)
 
 
 @contextlib.contextmanager
@@ -185,8 +185,8 @@ class _Perturbation:
         self._env = env
         self._noise = noise
         self._random = env.task.source.generator(NOISE_STREAM, scenario)
-        self._keep = math.exp(-env.variant.control_period_s / NOISE_TIME_S)
-        self._floor = NOISE_FLOOR * min(1.0, env.variant.tightest_tolerance_mm)
+        self._keep = math.exp(-env.spec.control_period_s / NOISE_TIME_S)
+        self._floor = NOISE_FLOOR * min(1.0, env.spec.tightest_tolerance_mm)
         self._state = self._random.normal(size=len(JOINT_RANGE_RAD))
 
     def apply(self, action: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

@@ -37,7 +37,7 @@ class Expert:
     """
 
     def __init__(self, env: Environment, *, plain: bool = False) -> None:
-        spec = env.variant
+        spec = env.spec
         if spec.action_mode != "joint_position":
             raise OptionError(
                 f"The expert commands joint positions, not {spec.action_mode}: load the "

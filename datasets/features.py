@@ -50,25 +50,25 @@ def image_key(camera: str) -> str:
     return f"observation.images.{camera}"
 
 
-def dataset_features(variant: Spec) -> dict[str, dict[str, Any]]:
+def dataset_features(spec: Spec) -> dict[str, dict[str, Any]]:
     """The features of a dataset of this task, in LeRobot's form.
 
     Raises:
         OptionError: The task observes what a LeRobot dataset cannot hold, or takes other actions
             than the expert's.
     """
-    names = observation_names(variant.observations)
-    channels = {"eih": variant.eih_channels, "eth": variant.eth_channels}
+    names = observation_names(spec.observations)
+    channels = {"eih": spec.eih_channels, "eth": spec.eth_channels}
     unfit = [name for name in names if name not in (*CAMERAS, *_STATE_SUFFIX)]
     unfit += [f"{name}_channels=1" for name in names if channels.get(name, 3) != 3]
-    unfit += ["normalise_observation=True"] if variant.normalise_observation else []
-    unfit += [] if variant.action_mode == "joint_position" else [f"{variant.action_mode} actions"]
+    unfit += ["normalise_observation=True"] if spec.normalise_observation else []
+    unfit += [] if spec.action_mode == "joint_position" else [f"{spec.action_mode} actions"]
     if unfit:
         raise OptionError(
             "a dataset holds uint8 RGB images, joint values in rad and joint_position actions; "
             f"leave out {', '.join(unfit)}"
         )
-    sides = {"eih": variant.eih_resolution, "eth": variant.eth_resolution}
+    sides = {"eih": spec.eih_resolution, "eth": spec.eth_resolution}
     features: dict[str, dict[str, Any]] = {
         image_key(name): {
             "dtype": "image",
@@ -78,7 +78,7 @@ def dataset_features(variant: Spec) -> dict[str, dict[str, Any]]:
         for name in names
         if name in CAMERAS
     }
-    state = [f"{joint}.{_STATE_SUFFIX[n]}" for n in _state_names(variant) for joint in JOINT_NAMES]
+    state = [f"{joint}.{_STATE_SUFFIX[n]}" for n in _state_names(spec) for joint in JOINT_NAMES]
     if state:
         features[STATE] = _vector(state)
     features[ACTION] = _vector([f"{joint}.pos" for joint in JOINT_NAMES])
@@ -87,30 +87,30 @@ def dataset_features(variant: Spec) -> dict[str, dict[str, Any]]:
     features["next.success"] = _scalar("bool", "success")
     features[ACTION_EXECUTED] = _vector([f"{joint}.pos" for joint in JOINT_NAMES])
     features[SCENARIO] = _scalar("int64", "scenario")
-    for name, dimensions in variant.privileged.items():
+    for name, dimensions in spec.privileged.items():
         features[f"{PRIVILEGED}{name}"] = _vector(list(dimensions))
-    features[ERRORS] = _vector([metric.name for metric in variant.metrics])
+    features[ERRORS] = _vector([metric.name for metric in spec.metrics])
     return features
 
 
 def observed_part(
-    variant: Spec, observation: Mapping[str, npt.NDArray[Any]], environment: Any
+    spec: Spec, observation: Mapping[str, npt.NDArray[Any]], environment: Any
 ) -> Frame:
     """The columns that are known before the action: observation and privileged values.
 
     Args:
-        variant: The task's parameters.
+        spec: The task's parameters.
         observation: What the policy sees.
         environment: The environment in that state.
     """
     frame: Frame = {image_key(name): observation[name] for name in CAMERAS if name in observation}
-    names = _state_names(variant)
+    names = _state_names(spec)
     if names:
         frame[STATE] = np.concatenate([observation[name] for name in names]).astype(np.float32)
     truth, info = environment.privileged(), environment.info
-    for name in variant.privileged:
+    for name in spec.privileged:
         frame[f"{PRIVILEGED}{name}"] = truth[name].astype(np.float32)
-    errors = [info["errors"][metric.name] for metric in variant.metrics]
+    errors = [info["errors"][metric.name] for metric in spec.metrics]
     frame[ERRORS] = np.array(errors, np.float32)
     frame[SCENARIO] = np.array([info["scenario"]], np.int64)
     return frame
@@ -141,9 +141,9 @@ def acted_part(
     }
 
 
-def _state_names(variant: Spec) -> list[str]:
+def _state_names(spec: Spec) -> list[str]:
     """The joint observations of a task, positions first."""
-    names = observation_names(variant.observations)
+    names = observation_names(spec.observations)
     return [name for name in _STATE_SUFFIX if name in names]
 
 

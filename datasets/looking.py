@@ -47,7 +47,7 @@ class Demonstrator(Expert):
     """
 
     def __init__(self, env: Environment) -> None:
-        spec = env.variant
+        spec = env.spec
         named = TASKS.get(spec.name)
         starts = {spec.start, named.start if named is not None else spec.start}
         super().__init__(env, plain="random" in starts)
@@ -74,7 +74,7 @@ class Demonstrator(Expert):
 
     def _look(self) -> None:
         """Notice whether a camera has the target in view."""
-        truth, [target, *_] = self._env.privileged(), self._env.variant.keypoints
+        truth, [target, *_] = self._env.privileged(), self._env.spec.keypoints
         seen = {name: truth[f"{target}_{name}"][3] > 0.5 for name in CAMERA_NAMES}
         self._has_seen = self._has_seen or any(seen.values())
         self._has_seen_closely = self._has_seen_closely or bool(seen["eih"])

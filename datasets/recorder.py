@@ -95,13 +95,13 @@ def record(
             records into it.
         DatasetError: What ``resume`` found was recorded otherwise.
     """
-    variant = find(task).with_options(dict(options or {}))
-    features = dataset_features(variant)
+    spec = find(task).with_options(dict(options or {}))
+    features = dataset_features(spec)
     _check_numbers(episodes, split, noise, workers, block)
     root = Path(out)
     metadata = DatasetMetadata(
         task=task,
-        task_version=variant.version,
+        task_version=spec.version,
         split=split,
         options=jsonable(options or {}),
         noise=float(noise),
@@ -119,8 +119,8 @@ def record(
     with taken(root, resume=resume):
         outcomes = published_outcomes(root)
         tracker = _Tracker(len(outcomes), sum(outcomes), episodes, progress)
-        fps = round(1.0 / variant.control_period_s)
-        writer = DatasetWriter(root, features, fps, variant.instruction(), block)
+        fps = round(1.0 / spec.control_period_s)
+        writer = DatasetWriter(root, features, fps, spec.instruction(), block)
         played = play(
             MakeEnvironment(task, split, dict(options or {})),
             make_demonstrator,

@@ -99,7 +99,7 @@ def replay(root: Path, episode: int) -> Replay:
     pictures, actions = recorded.pictures, recorded.actions
     cells: list[Picture] = []
     with load(metadata.task, split=metadata.split, **metadata.options) as env:
-        variant = env.variant
+        spec = env.spec
         time_step = env.reset(scenario=recorded.scenario)
         cells.append(env.render(width=CELL_SIDE, height=CELL_SIDE))
         for action in actions:
@@ -109,7 +109,7 @@ def replay(root: Path, episode: int) -> Replay:
                 )
             time_step = env.step(action)
             cells.append(env.render(width=CELL_SIDE, height=CELL_SIDE))
-        at_end = [env.info["errors"][metric.name] for metric in variant.metrics]
+        at_end = [env.info["errors"][metric.name] for metric in spec.metrics]
         for camera, shown in pictures.items():
             shown.append(as_rgb(time_step.observation[camera]))
     errors = np.vstack([recorded.errors, at_end])
@@ -118,16 +118,16 @@ def replay(root: Path, episode: int) -> Replay:
     tail += _noise_in_words(metadata)
     frames = [
         _frame(
-            variant,
+            spec,
             cells[step],
             {camera: shown[step] for camera, shown in pictures.items()},
-            _curves(variant, errors, step),
+            _curves(spec, errors, step),
             (head, tail),
             (step, len(actions), recorded.success),
         )
         for step in range(len(cells))
     ]
-    return Replay(frames, 1.0 / variant.control_period_s, recorded.scenario, recorded.success)
+    return Replay(frames, 1.0 / spec.control_period_s, recorded.scenario, recorded.success)
 
 
 def read_recorded(root: Path, episode: int) -> Recorded:
@@ -145,7 +145,7 @@ def read_recorded(root: Path, episode: int) -> Recorded:
     """
     metadata = read_metadata(root)
     try:
-        variant = find(metadata.task).with_options(metadata.options)
+        spec = find(metadata.task).with_options(metadata.options)
     except (UnknownTaskError, OptionError) as error:
         raise DatasetError(f"{root}: {METADATA_FILE}: {error}") from error
     info = reader.read_info(root)
@@ -159,7 +159,7 @@ def read_recorded(root: Path, episode: int) -> Recorded:
         if image_key(camera) in info["features"]
     }
     numbers = {}
-    shapes = dataset_features(variant)
+    shapes = dataset_features(spec)
     for name in (ERRORS, ACTION_EXECUTED, SCENARIO, "next.success"):
         with reader.in_file(root, place.file):
             numbers[name] = reader.column(table, name)
@@ -197,7 +197,7 @@ def _noise_in_words(metadata: DatasetMetadata) -> str:
 
 
 def _frame(
-    variant: "Spec",
+    spec: "Spec",
     cell: Picture,
     pictures: Mapping[str, Picture],
     curves: Picture,
@@ -236,11 +236,11 @@ def _frame(
     return np.asarray(frame)
 
 
-def _curves(variant: "Spec", errors: npt.NDArray[Any], step: int) -> Picture:
+def _curves(spec: "Spec", errors: npt.NDArray[Any], step: int) -> Picture:
     """Lengths and angles over the steps, bold up to now, with the tolerances.
 
     Args:
-        variant: Whose tolerances are drawn.
+        spec: Whose tolerances are drawn.
         errors: (steps + 1, k), the metrics of the task.
         step: Now.
 
@@ -252,7 +252,7 @@ def _curves(variant: "Spec", errors: npt.NDArray[Any], step: int) -> Picture:
     figure = Figure(figsize=(WIDTH / DPI, CURVES_HEIGHT / DPI), dpi=DPI, facecolor=_hex(PAPER))
     figure.subplots_adjust(left=0.075, right=0.982, bottom=0.2, top=0.88, wspace=0.2)
     lines: dict[str, list[tuple[str, int, float | None]]] = {}
-    for index, metric in enumerate(variant.metrics):
+    for index, metric in enumerate(spec.metrics):
         if metric.bound is not None and metric.over == "step":
             line = (metric.title.removesuffix(" error"), index, metric.bound)
             lines.setdefault(metric.unit, []).append(line)

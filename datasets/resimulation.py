@@ -62,7 +62,7 @@ class Difference:
 
 def resimulate(
     env: "Environment",
-    variant: "Spec",
+    spec: "Spec",
     columns: Mapping[str, npt.NDArray[Any]],
     features: Mapping[str, Mapping[str, Any]],
     *,
@@ -73,7 +73,7 @@ def resimulate(
 
     Args:
         env: The task with the dataset's split and options.
-        variant: The dataset's task with all its observations.
+        spec: The dataset's task with all its observations.
         columns: The episode's columns, (n, k) or (n,).
         features: LeRobot's features, for the names of dimensions.
         picture: Returns the recorded picture of (camera's feature, frame), or None where it is
@@ -92,7 +92,7 @@ def resimulate(
                 frame, "next.done", f"the episode goes on, re-simulated it ends at {frame - 1}"
             )
             break
-        seen: Frame = observed_part(variant, _without_pictures(time_step.observation), env)
+        seen: Frame = observed_part(spec, _without_pictures(time_step.observation), env)
         if picture is not None:
             _compare_pictures(found, frame, time_step.observation, picture, lossy)
         time_step = env.step(action)
@@ -103,7 +103,7 @@ def resimulate(
             time_step.last(),
             env.info["is_success"],
         )
-        for name in (STATE, ERRORS, *(f"{PRIVILEGED}{n}" for n in variant.privileged), *OUTCOMES):
+        for name in (STATE, ERRORS, *(f"{PRIVILEGED}{n}" for n in spec.privileged), *OUTCOMES):
             if name in columns and name in seen and name not in found:
                 _compare(found, frame, name, columns[name][frame], seen[name], features)
     return sorted(found.values(), key=lambda each: (each.frame, each.column))

@@ -171,7 +171,7 @@ def _draw(env: "Environment", order: _Order) -> None:
 
     trial.play_trial(env, lambda: None, decide, order.row.scenario)
     frames.append(_frame(env))
-    frame_ms = round(1000 * env.variant.control_period_s)
+    frame_ms = round(1000 * env.spec.control_period_s)
     with files.replacing(order.path) as temporary:
         frames[0].save(
             temporary,
@@ -199,7 +199,7 @@ def _frame(env: "Environment") -> "Image":
         frame.paste(Image.fromarray(image), (SIZE[0] - _CAMERA, row * _CAMERA))
     info = env.info
     figures = (
-        f"{info['steps'] * env.variant.control_period_s:.1f} s",
+        f"{info['steps'] * env.spec.control_period_s:.1f} s",
         f"{info['position_error_mm']:.2f} mm",
         f"{info['tilt_error_deg']:.2f}°",
     )

@@ -236,33 +236,11 @@ def overall(entries: Sequence[Entry]) -> list[Overall]:
 
 def describe(task: str) -> str:
     """Returns what a task (its name, without version) asks for, in one line."""
-    v = registry.find(task)
-    bounds = [
-        (v.position_tolerance_mm, " mm"),
-        (v.lateral_tolerance_mm, " mm sideways"),
-        (v.height_tolerance_mm, " mm in height"),
-        (v.tilt_tolerance_deg, "°"),
-    ]
-    tolerance = ", ".join(f"{bound:g}{unit}" for bound, unit in bounds if bound is not None)
-    held = "" if v.hold_steps == 1 else f", held for {v.hold_steps} steps"
-    disturbances = [
-        name
-        for name, there in (
-            ("light", v.vary_light),
-            ("colour", v.vary_colour),
-            ("texture", v.vary_texture),
-            ("camera pose", v.eth_position_noise_m > 0),
-            ("image noise", v.image_noise > 0),
-            ("joint offsets", v.joint_offset_deg > 0),
-            ("latency", v.latency_steps > 0),
-        )
-        if there
-    ]
-    disturbed = f"Disturbed: {', '.join(disturbances)}" if disturbances else "Undisturbed"
-    start = {"zero": "from the zero pose", "random": "from anywhere"}.get(str(v.start), "")
+    words = registry.find(task).describe()
+    held = f", held for {words.held}" if words.held else ""
     return (
-        f"To within {tolerance}{held}, {start}, in {v.time_limit_steps} steps of "
-        f"{v.control_period_s:g} s. {disturbed}."
+        f"start {words.start}; target: {words.target}; within {words.tolerance}{held}; "
+        f"{words.time}; disturbed: {'nothing' if words.disturbances == '-' else words.disturbances}"
     )
 
 

@@ -181,7 +181,7 @@ def _sort(
         errors_mm.append(float(env.info["position_error_mm"]))
     return Failure(
         scenario=row.scenario,
-        cause=cause_of(row, env.variant, seen, off_mm, errors_mm),
+        cause=cause_of(row, env.spec, seen, off_mm, errors_mm),
         steps=row.steps,
         position_error_mm=row.position_error_mm,
         tilt_error_deg=row.tilt_error_deg,
@@ -193,7 +193,7 @@ def _sort(
 
 def cause_of(
     row: EpisodeRow,
-    variant: Spec,
+    spec: Spec,
     seen_steps: int,
     estimate_error_mm: float | None,
     errors_mm: Sequence[float],
@@ -202,12 +202,12 @@ def cause_of(
 
     Args:
         row: Its outcome.
-        variant: The task's parameters.
+        spec: The task's parameters.
         seen_steps: As in `Failure`.
         estimate_error_mm: As in `Failure`.
         errors_mm: Position error at the start and after every step (mm).
     """
-    bounds = variant.tolerances
+    bounds = spec.tolerances
     tolerance_mm = next(
         bounds[name] for name in ("position_error_mm", "lateral_error_mm") if name in bounds
     )

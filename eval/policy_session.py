@@ -122,8 +122,8 @@ def served(name: str, task: Any, message: wire.Message) -> tuple[Contender, Poli
         action = spec("action", message["action"])
     except (KeyError, TypeError, ValueError) as error:
         raise wire.WireError("hello describes observations and action") from error
-    variant = TASKS[task]
-    return player, PolicyContext(variant, observations, action, variant.control_period_s)
+    period_s = TASKS[task].control_period_s
+    return player, PolicyContext(TASKS[task], observations, action, period_s)
 
 
 def spec(name: str, description: dict[str, Any]) -> specs.BoundedArray:

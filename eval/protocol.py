@@ -101,7 +101,7 @@ def evaluate(
             f"split {TEST_SPLIT!r} holds {TEST_SCENARIOS} scenarios, not {episodes}; ask for "
             f"{TEST_SCENARIOS} episodes or fewer"
         )
-    variant = registry.find(task)
+    spec = registry.find(task)
     player = contender.find(policy, task) if isinstance(policy, str) else policy
     make = player.make
     if player.kind == "module":
@@ -150,16 +150,16 @@ def evaluate(
                 player.name,
                 split,
                 rows,
-                tolerances=variant.tolerances,
-                time_limit_steps=variant.time_limit_steps,
+                tolerances=spec.tolerances,
+                time_limit_steps=spec.time_limit_steps,
             ),
             metadata=result_file.Metadata(
                 created=created,
                 suite_version=provenance.suite_version(),
-                task_version=variant.version,
+                task_version=spec.version,
                 task_digest=lock.digest(task),
-                tolerances=variant.tolerances,
-                time_limit_steps=variant.time_limit_steps,
+                tolerances=spec.tolerances,
+                time_limit_steps=spec.time_limit_steps,
                 options={},
                 policy_kind=player.kind,
                 policy_hash=player.hash,

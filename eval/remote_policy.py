@@ -355,17 +355,17 @@ def find(url: str, name: str, task: str, decision_limit_s: float = DECISION_LIMI
 
 def hello(task: str, env: Any) -> wire.Message:
     """Returns the first message: which task is to be played, and what of it is public."""
-    variant = env.variant
+    spec = env.spec
     return {
         "type": "hello",
         "protocol": wire.PROTOCOL,
         "suite_version": suite_version(),
         "task": task,
-        "task_version": variant.version,
+        "task_version": spec.version,
         "task_digest": lock.digest(task),
-        "instruction": variant.instruction(),
-        "period_s": variant.control_period_s,
-        "parameters": dataclasses.asdict(variant),
+        "instruction": spec.instruction(),
+        "period_s": spec.control_period_s,
+        "parameters": dataclasses.asdict(spec),
         "observations": {name: _describe(spec) for name, spec in env.observation_spec().items()},
         "action": _describe(env.action_spec()),
     }

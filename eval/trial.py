@@ -57,7 +57,7 @@ class Stage(Protocol):
         """Where the flange stands over the target, (2,) mm."""
 
     @property
-    def variant(self) -> Any:
+    def spec(self) -> Any:
         """The task's parameters."""
 
     def action_spec(self) -> Any:
@@ -305,10 +305,10 @@ def play_trial(env: Stage, start: Callable[[], None], decide: Decide, scenario: 
         failure = error.reason
     return Course(
         scenario=int(scenario),
-        hold_steps=env.variant.hold_steps,
+        hold_steps=env.spec.hold_steps,
         actions=np.array(actions, np.float32).reshape(-1, *spec.shape),
         inside=np.array([info["n_inside"] > 0 for info in infos[1:]], np.bool_),
-        excess=np.array([_excess(info, env.variant.tolerances) for info in infos[1:]], np.float64),
+        excess=np.array([_excess(info, env.spec.tolerances) for info in infos[1:]], np.float64),
         clipped=np.array(clipped, np.bool_),
         errors=[_errors(info) for info in infos],
         collision=bool(infos[-1]["collision"]),

@@ -160,7 +160,7 @@ def check_task(path: Path, result: Result) -> None:
         ResultError: It was not.
         UnknownTaskError: There is no such task.
     """
-    variant = registry.find(result.summary.task)
+    spec = registry.find(result.summary.task)
     ours, metadata = result.summary.task, result.metadata
     if metadata.options:
         options = ", ".join(sorted(metadata.options))
@@ -168,10 +168,10 @@ def check_task(path: Path, result: Result) -> None:
             f"{path}: the task was changed ({options}); only the task as named is scored"
         )
     for name, said, known in (
-        ("task_version", metadata.task_version, variant.version),
+        ("task_version", metadata.task_version, spec.version),
         ("task_digest", metadata.task_digest, lock.digest(ours)),
-        ("tolerances", metadata.tolerances, variant.tolerances),
-        ("time_limit_steps", metadata.time_limit_steps, variant.time_limit_steps),
+        ("tolerances", metadata.tolerances, spec.tolerances),
+        ("time_limit_steps", metadata.time_limit_steps, spec.time_limit_steps),
     ):
         if said != known:
             raise ResultError(

@@ -30,7 +30,7 @@ RENDER_SIDE_PX = 480
 Observation = dict[str, npt.NDArray[Any]]
 
 
-class AlignEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
+class TaskEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
     """A named task behind Gymnasium's interface.
 
     Observations are a flat ``Dict``: ``eih`` and ``eth`` uint8 (H, W, C), ``joint_positions``
@@ -72,10 +72,10 @@ class AlignEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
         self._environment = load(task, split=split, **options)
         self._environment.clip_actions = True
         self.render_mode = render_mode
-        variant = self._environment.variant
-        self.metadata = {**self.metadata, "render_fps": round(1.0 / variant.control_period_s)}
-        self.task = variant.name
-        self.task_description = variant.instruction()
+        spec = self._environment.spec
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / spec.control_period_s)}
+        self.task = spec.name
+        self.task_description = spec.instruction()
         specification = self._environment.observation_spec()
         self._spaces: dict[str, spaces.Space[Any]] = {
             name: _space(spec) for name, spec in specification.items()
@@ -83,7 +83,7 @@ class AlignEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
         self.observation_space = spaces.Dict(self._spaces)
         action = self._environment.action_spec()
         self.action_space = spaces.Box(-1.0, 1.0, action.shape, np.float32)
-        self._max_episode_steps: int = variant.time_limit_steps
+        self._max_episode_steps: int = spec.time_limit_steps
         self._playing = False
         self._frame: npt.NDArray[np.uint8] | None = None
 
@@ -185,13 +185,13 @@ class PixelsAgentPos(gymnasium.Wrapper[Any, Any, Observation, Any]):
     positions (rad), then velocities (rad/s), float32 (14,).
 
     Args:
-        env: An :class:`AlignEnv`.
+        env: An :class:`TaskEnv`.
 
     Raises:
         OptionError: The task's images are not uint8 RGB, which is all that LeRobot takes.
     """
 
-    def __init__(self, env: AlignEnv) -> None:
+    def __init__(self, env: TaskEnv) -> None:
         super().__init__(env)
         inner = cast(spaces.Dict, env.observation_space)
         cameras = {name: space for name, space in inner.items() if len(space.shape or ()) == 3}
@@ -218,12 +218,12 @@ class PixelsAgentPos(gymnasium.Wrapper[Any, Any, Observation, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """As :meth:`AlignEnv.reset`."""
+        """As :meth:`TaskEnv.reset`."""
         observation, info = self.env.reset(seed=seed, options=options)
         return self._view(observation), info
 
     def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """As :meth:`AlignEnv.step`."""
+        """As :meth:`TaskEnv.step`."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         return self._view(observation), float(reward), terminated, truncated, info
 
@@ -236,14 +236,14 @@ class PixelsAgentPos(gymnasium.Wrapper[Any, Any, Observation, Any]):
 
 def make_pixels_agent_pos(task: str, **options: Any) -> PixelsAgentPos:
     """Makes the LeRobot view of a named task; importable by worker processes without LeRobot."""
-    return PixelsAgentPos(AlignEnv(task, **options))
+    return PixelsAgentPos(TaskEnv(task, **options))
 
 
 def register() -> None:
     """Registers ``hvs_suite/<name>-v<version>`` for every named task; again does nothing."""
-    for name, variant in TASKS.items():
-        identifier = f"{NAMESPACE}/{name}-v{variant.version}"
+    for name, spec in TASKS.items():
+        identifier = f"{NAMESPACE}/{name}-v{spec.version}"
         if identifier not in gymnasium.registry:
             # A string, so that registering imports nothing; time limit and order of calls are the
             # environment's own.
-            gymnasium.register(identifier, "hvs_suite.gym:AlignEnv", kwargs={"task": name})
+            gymnasium.register(identifier, "hvs_suite.gym:TaskEnv", kwargs={"task": name})

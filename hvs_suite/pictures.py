@@ -102,7 +102,7 @@ def film_frame(
     _draw_cameras(panel, draw, images)
     top = MARGIN + 20 + CAMERA_SIDE + MARGIN
     top = _draw_joints(draw, np.asarray(env.joint_positions), top)
-    _draw_standing(draw, env.variant, env.info, top, reward_terms, reward_sum)
+    _draw_standing(draw, env.spec, env.info, top, reward_terms, reward_sum)
     frame.paste(panel, (CELL_SIDE, 0))
     return np.asarray(frame)
 
@@ -263,7 +263,7 @@ def _draw_joints(draw: "ImageDraw", joints: npt.NDArray[np.float64], top: int) -
 
 def _draw_standing(
     draw: "ImageDraw",
-    variant: "Spec",
+    spec: "Spec",
     info: Mapping[str, Any],
     top: int,
     reward_terms: Mapping[str, float],
@@ -271,9 +271,9 @@ def _draw_standing(
 ) -> None:
     """Step count, errors against their tolerances, reward, and how the episode ended."""
     rows: list[tuple[str, str, bool | None]] = [
-        ("step", f"{info['steps']} of {variant.time_limit_steps}", None)
+        ("step", f"{info['steps']} of {spec.time_limit_steps}", None)
     ]
-    for metric in variant.metrics:
+    for metric in spec.metrics:
         if metric.bound is not None:
             error = info["errors"][metric.name]
             unit = "°" if metric.unit == "deg" else f" {metric.unit}".rstrip()

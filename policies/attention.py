@@ -59,7 +59,7 @@ def draw_attention(folder: Path, env: "Environment", policy: Policy, scenario: i
         ]
         for camera in network.shape.cameras
     }
-    return strip(rows, [step * env.variant.control_period_s for step in steps])
+    return strip(rows, [step * env.spec.control_period_s for step in steps])
 
 
 class _Seen:

@@ -49,7 +49,7 @@ class Stage(Protocol):
     """What a checkpoint needs of an environment."""
 
     @property
-    def variant(self) -> Spec:
+    def spec(self) -> Spec:
         """Parameters of the task."""
 
 
@@ -69,7 +69,7 @@ class CheckpointFactory:
         Raises:
             PolicyError: It cannot be loaded, or does not fit the environment.
         """
-        return CheckpointPolicy(Path(self.folder), env.variant)
+        return CheckpointPolicy(Path(self.folder), env.spec)
 
 
 class CheckpointPolicy:
@@ -77,21 +77,21 @@ class CheckpointPolicy:
 
     Args:
         folder: The checkpoint.
-        variant: Task to be played.
+        spec: Task to be played.
 
     Raises:
         PolicyError: The checkpoint cannot be loaded, or does not fit the task.
     """
 
-    def __init__(self, folder: Path, variant: Spec) -> None:
+    def __init__(self, folder: Path, spec: Spec) -> None:
         config = read_config(folder)
-        check_fit(config, folder, variant)
+        check_fit(config, folder, spec)
         self._inputs = tuple(config["input_features"])
         with one_torch_thread():
             if config.get("type") == "hvs" and _processors_are_standard(folder):
                 self._decide, self._forget = _network(folder, config)
             else:
-                self._decide, self._forget = _lerobot(folder, variant.instruction())
+                self._decide, self._forget = _lerobot(folder, spec.instruction())
 
     def reset(self) -> None:
         """Forget the last episode."""
@@ -182,20 +182,20 @@ def read_config(folder: Path) -> dict[str, Any]:
     return config
 
 
-def check_fit(config: Mapping[str, Any], folder: Path, variant: Spec) -> None:
+def check_fit(config: Mapping[str, Any], folder: Path, spec: Spec) -> None:
     """Check that a task shows what a checkpoint reads, in the same size, and takes its actions.
 
     Args:
         config: Of the checkpoint.
         folder: The checkpoint, for the message.
-        variant: The task.
+        spec: The task.
 
     Raises:
         PolicyError: It does not fit.
     """
-    shown = observation_names(variant.observations)
-    mismatch = f"{folder} does not fit {variant.name}: "
-    if variant.action_mode != "joint_position" or variant.normalise_observation:
+    shown = observation_names(spec.observations)
+    mismatch = f"{folder} does not fit {spec.name}: "
+    if spec.action_mode != "joint_position" or spec.normalise_observation:
         raise PolicyError(
             mismatch + "checkpoints read raw observations and command joint positions"
         )
@@ -213,8 +213,8 @@ def check_fit(config: Mapping[str, Any], folder: Path, variant: Spec) -> None:
         elif name == key or name not in shown or name not in ("eih", "eth"):
             raise PolicyError(mismatch + f"it reads {key}, which the task does not show")
         else:
-            side = getattr(variant, f"{name}_resolution")
-            expected = (getattr(variant, f"{name}_channels"), side, side)
+            side = getattr(spec, f"{name}_resolution")
+            expected = (getattr(spec, f"{name}_channels"), side, side)
             if shape != expected:
                 raise PolicyError(
                     mismatch + f"it reads {key} as {_size(shape)}, the task shows {_size(expected)}"

@@ -17,13 +17,13 @@ class PolicyContext:
     """The public side of a task.
 
     Attributes:
-        variant: Parameters of the task; camera poses are nominal.
+        spec: Parameters of the task; camera poses are nominal.
         observations: Shape, type and bounds of each observation, by name.
         action: Shape and bounds of an action.
         period_s: Control period (s).
     """
 
-    variant: Spec
+    spec: Spec
     observations: dict[str, Any]
     action: Any
     period_s: float
@@ -32,10 +32,10 @@ class PolicyContext:
     def of(cls, env: Any) -> Self:
         """Returns what may be known of an environment."""
         return cls(
-            variant=env.variant,
+            spec=env.spec,
             observations=dict(env.observation_spec()),
             action=env.action_spec(),
-            period_s=env.variant.control_period_s,
+            period_s=env.spec.control_period_s,
         )
 
     def observation_spec(self) -> dict[str, Any]:

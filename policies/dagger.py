@@ -103,7 +103,7 @@ def _played(
     policy.reset()
     frames: list[Frame] = []
     while not time_step.last():
-        frame = observed_part(env.variant, time_step.observation, env)
+        frame = observed_part(env.spec, time_step.observation, env)
         labelled = frame | label()
         action = np.clip(policy.select_action(time_step.observation), -1.0, 1.0).astype(np.float32)
         frames.append(labelled | {ACTION_EXECUTED: action})

@@ -359,8 +359,8 @@ def _standoff(manifest: Manifest) -> float:
     spec = find(manifest.task).with_options(manifest.options)
     if not isinstance(spec, PlacingSpec):
         raise DatasetError(
-            f"{manifest.root} was recorded on {manifest.task}; this policy knows targets on a level "
-            "surface alone"
+            f"{manifest.root} was recorded on {manifest.task}; this policy knows targets on a "
+            "level surface alone"
         )
     return spec.standoff_m
 

@@ -180,7 +180,9 @@ class Sequence(Placing[SequenceSpec, SequenceScenario]):
         from hvs_suite.tasks.shared import certificate
 
         return [
-            *certificate.check_legs(env, scenarios, lambda scenario: scenario.targets),
+            *certificate.check_legs(
+                env, scenarios, lambda scenario: scenario.targets, env.task.family.spec.target_steps
+            ),
             *certificate.check_visibility(env, scenarios),
             *certificate.check_accuracy(env, scenarios),
         ]

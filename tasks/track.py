@@ -111,8 +111,8 @@ class TrackSpec(PlacingSpec):
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class TrackScenario(Scenario):
-    """One scene: the target is at ``centre + velocity t + sum of amplitude sin(omega t + phase)``.
+class Motion:
+    """A motion: ``centre + velocity t + sum of amplitude sin(omega t + phase)``.
 
     Attributes:
         centre: (2,) m, base frame.
@@ -128,23 +128,34 @@ class TrackScenario(Scenario):
     omega: FloatArray
     phase: FloatArray
 
-    def place(self, time_s: FloatArray | float) -> FloatArray:
+    def place(self, time_s: npt.ArrayLike) -> FloatArray:
         """Where the target is at times (...,) s: (..., 2) m."""
-        time = np.asarray(time_s)[..., None]
-        waves = self.amplitude * np.sin(self.omega * time[..., None] + self.phase)
-        return np.asarray(self.centre + self.velocity * time + waves.sum(axis=-2))
+        time = np.asarray(time_s, np.float64)[..., None]
+        return np.asarray(self.centre + self.velocity * time + self._waves(np.sin, time, 0))
 
-    def speed(self, time_s: FloatArray | float) -> FloatArray:
+    def speed(self, time_s: npt.ArrayLike) -> FloatArray:
         """How fast it moves at times (...,) s: (..., 2) m/s."""
-        time = np.asarray(time_s)[..., None]
-        waves = self.amplitude * self.omega * np.cos(self.omega * time[..., None] + self.phase)
-        return np.asarray(self.velocity + waves.sum(axis=-2))
+        time = np.asarray(time_s, np.float64)[..., None]
+        return np.asarray(self.velocity + self._waves(np.cos, time, 1))
 
-    def acceleration(self, time_s: FloatArray | float) -> FloatArray:
+    def acceleration(self, time_s: npt.ArrayLike) -> FloatArray:
         """How fast that changes at times (...,) s: (..., 2) m/s^2."""
-        time = np.asarray(time_s)[..., None, None]
-        waves = self.amplitude * self.omega**2 * np.sin(self.omega * time + self.phase)
-        return np.asarray(-waves.sum(axis=-2))
+        return -self._waves(np.sin, np.asarray(time_s, np.float64)[..., None], 2)
+
+    def _waves(self, wave: np.ufunc, time: FloatArray, derivative: int) -> FloatArray:
+        height = self.amplitude * self.omega**derivative
+        return np.asarray((height * wave(self.omega * time[..., None] + self.phase)).sum(axis=-2))
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class TrackScenario(Scenario):
+    """One scene.
+
+    Attributes:
+        motion: How the target moves.
+    """
+
+    motion: Motion
 
 
 class Track(Placing[TrackSpec, TrackScenario]):
@@ -155,26 +166,27 @@ class Track(Placing[TrackSpec, TrackScenario]):
         from hvs_suite.tasks.shared.start import draw_start
 
         motion = self._draw_motion(streams)
-        look = draw_look(self.spec, streams)
-        still = TrackScenario(start=np.zeros(7), **motion, **look)
-        first = self.goal_over(*still.place(0.0))
+        first = self.goal_over(*motion.place(0.0))
         own = self.named.start if self.named is not None else "zero"
-        return dataclasses.replace(
-            still, start=draw_start(self.spec, own, streams, first, first.normal)
+        return TrackScenario(
+            motion=motion,
+            start=draw_start(self.spec, own, streams, first, first.normal),
+            **draw_look(self.spec, streams),
         )
 
-    def _draw_motion(self, streams: Streams) -> dict[str, FloatArray]:
+    def _draw_motion(self, streams: Streams) -> Motion:
         """Draw motions until one stays on the ring for the whole episode."""
         spec, random = self.spec, streams.generator("motion")
         fastest = random.uniform(*spec.speed_m_s)
-        times = np.arange(spec.time_limit_steps + 1) * spec.control_period_s
-        look = draw_look(spec, streams)
+        times: FloatArray = spec.control_period_s * np.arange(
+            spec.time_limit_steps + 1, dtype=np.float64
+        )
         for _ in range(_MAX_REDRAWS):
-            motion = self._line(random, fastest)
-            if spec.motion == "curve":
-                motion = self._curve(random, fastest, times, look)
-            tried = TrackScenario(start=np.zeros(7), **motion, **look)
-            radius = np.hypot(*tried.place(times).T)
+            if spec.motion == "line":
+                motion = self._line(random, fastest)
+            else:
+                motion = self._curve(random, fastest, times)
+            radius = np.hypot(*motion.place(times).T)
             if spec.ring_m[0] <= radius.min() and radius.max() <= spec.ring_m[1]:
                 return motion
         raise OptionError(
@@ -182,39 +194,32 @@ class Track(Placing[TrackSpec, TrackScenario]):
             "on the ring; lower speed_m_s or time_limit_steps"
         )
 
-    def _line(self, random: np.random.Generator, fastest: float) -> dict[str, FloatArray]:
+    def _line(self, random: np.random.Generator, fastest: float) -> Motion:
         heading = random.uniform(-np.pi, np.pi)
         none = np.zeros((_N_SINES, 2))
-        return {
-            "centre": np.array(self.draw_on_ring(random)),
-            "velocity": fastest * np.array([np.cos(heading), np.sin(heading)]),
-            "amplitude": none,
-            "omega": none,
-            "phase": none,
-        }
+        return Motion(
+            centre=np.array(self.draw_on_ring(random)),
+            velocity=fastest * np.array([np.cos(heading), np.sin(heading)]),
+            amplitude=none,
+            omega=none,
+            phase=none,
+        )
 
-    def _curve(
-        self,
-        random: np.random.Generator,
-        fastest: float,
-        times: FloatArray,
-        look: Mapping[str, object],
-    ) -> dict[str, FloatArray]:
+    def _curve(self, random: np.random.Generator, fastest: float, times: FloatArray) -> Motion:
         """Sines of random weight, scaled so that neither speed nor acceleration is exceeded."""
-        motion = {
-            "centre": np.array(self.draw_on_ring(random)),
-            "velocity": np.zeros(2),
-            "amplitude": random.normal(size=(_N_SINES, 2)),
-            "omega": 2.0 * np.pi * random.uniform(*_FREQUENCY_HZ, (_N_SINES, 2)),
-            "phase": random.uniform(-np.pi, np.pi, (_N_SINES, 2)),
-        }
-        # Slow sines sway farther at the same speed.
-        motion["amplitude"] /= motion["omega"]
-        wild = TrackScenario(start=np.zeros(7), **motion, **look)  # type: ignore[arg-type]
+        omega = 2.0 * np.pi * random.uniform(*_FREQUENCY_HZ, (_N_SINES, 2))
+        wild = Motion(
+            centre=np.array(self.draw_on_ring(random)),
+            velocity=np.zeros(2),
+            # Slow sines sway farther at the same speed.
+            amplitude=random.normal(size=(_N_SINES, 2)) / omega,
+            omega=omega,
+            phase=random.uniform(-np.pi, np.pi, (_N_SINES, 2)),
+        )
         speed = np.linalg.norm(wild.speed(times), axis=1).max()
         acceleration = np.linalg.norm(wild.acceleration(times), axis=1).max()
-        motion["amplitude"] *= min(fastest / speed, self.spec.acceleration_m_s2 / acceleration)
-        return motion
+        tame = min(fastest / speed, self.spec.acceleration_m_s2 / acceleration)
+        return dataclasses.replace(wild, amplitude=tame * wild.amplitude)
 
     def begin(self, physics: "mjcf.Physics", scenario: TrackScenario) -> None:
         """Lay the marker where it starts."""
@@ -231,8 +236,8 @@ class Track(Placing[TrackSpec, TrackScenario]):
     def goal(self, ahead_s: float = 0.0) -> Goal:
         """Over where the target is, or will be."""
         time_s = self._time_s + ahead_s
-        x, y = self.scenario.place(time_s).tolist()
-        velocity = np.append(self.scenario.speed(time_s), 0.0)
+        x, y = self.scenario.motion.place(time_s).tolist()
+        velocity = np.append(self.scenario.motion.speed(time_s), 0.0)
         return Goal(np.array([x, y, 0.0]), UP, self.spec.standoff_m, velocity)
 
     def privileged(self) -> dict[str, FloatArray]:

@@ -28,7 +28,7 @@ def way(start: FloatArray, goal: FloatArray, n: int = 40) -> FloatArray:
 def goal_posture(env: "Environment") -> FloatArray:
     """The goal posture that the arm gets to soonest from its start without touching anything."""
     scenario = env.scenario
-    goal = scenario.target + scenario.normal * env.variant.standoff_m
+    goal = scenario.target + scenario.normal * env.spec.standoff_m
     start = scenario.start
     family = kinematics().goal_configurations_at_tool_angle(goal, scenario.normal, float(start[6]))
     for q in family[np.argsort(travel_time(start, family, acceleration_limits=False))]:
@@ -39,7 +39,7 @@ def goal_posture(env: "Environment") -> FloatArray:
 
 def _is_clear(env: "Environment", steps: FloatArray) -> bool:
     # The clearance query knows level surfaces only; on others MuJoCo's contacts have to do.
-    level = env.variant.surface == "flat"
+    level = env.spec.surface == "flat"
     floor = 0.0 if level else -1.0
     if any(kinematics().clearance(q, floor) < _CLEARANCE_M for q in steps):
         return False
@@ -77,9 +77,9 @@ def displaced(
         tilt_deg: Angle between the flange axis and the inward normal (deg).
         yaw: Turn about the flange axis (rad).
     """
-    scenario, variant = env.scenario, env.variant
+    scenario, spec = env.scenario, env.spec
     frame = tool_frame(scenario.normal)
-    goal = scenario.target + scenario.normal * (variant.standoff_m + height_m)
+    goal = scenario.target + scenario.normal * (spec.standoff_m + height_m)
     angle = np.deg2rad(tilt_deg)
     swivel = np.linspace(-np.pi, np.pi, 24)
     # At the rim of the working area only some directions stay within reach.

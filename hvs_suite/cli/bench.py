@@ -188,7 +188,7 @@ def run_once(env: "Environment", scenario: int) -> TimedEpisode:
     goal = np.clip(
         origin + draw.uniform(-REACH_RAD, REACH_RAD, 7), -JOINT_RANGE_RAD, JOINT_RANGE_RAD
     )
-    limit = env.variant.time_limit_steps
+    limit = env.spec.time_limit_steps
     controls: list[npt.NDArray[np.float64]] = []
     step_s = 0.0
     for step in range(limit):
@@ -220,11 +220,9 @@ class BareLoop:
         self._model = env.physics.model.ptr
         self._data = mujoco.MjData(self._model)
         self._n_substeps = env.task.physics_steps_per_control_step
-        side = max(env.variant.eih_resolution, env.variant.eth_resolution)
+        side = max(env.spec.eih_resolution, env.spec.eth_resolution)
         self._gl = create_context(side, side)
-        self._context = offscreen_context(
-            self._model, side, env.variant.multisampling, shadow_size=0
-        )
+        self._context = offscreen_context(self._model, side, env.spec.multisampling, shadow_size=0)
         self._scene = mujoco.MjvScene(self._model, 256)
         for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._scene.flags[flag] = False
@@ -235,8 +233,8 @@ class BareLoop:
         self._perturbation = mujoco.MjvPerturb()
         self._cameras = []
         for name, resolution in (
-            ("eih", env.variant.eih_resolution),
-            ("eth", env.variant.eth_resolution),
+            ("eih", env.spec.eih_resolution),
+            ("eth", env.spec.eth_resolution),
         ):
             camera = mujoco.MjvCamera()
             camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value

@@ -63,7 +63,7 @@ def expert_figures(task: str, episodes: int) -> dict[str, float]:
                 steps.append(episode.steps)
                 bounds.append(
                     least_times(
-                        env.variant,
+                        env.spec,
                         env.scenario.start,
                         truth["goal_position"],
                         truth["goal_normal"],
@@ -93,7 +93,7 @@ def expert_figures(task: str, episodes: int) -> dict[str, float]:
 
 
 def least_times(
-    variant: "Spec",
+    spec: "Spec",
     start: npt.NDArray[np.float64],
     goal: npt.NDArray[np.float64],
     normal: npt.NDArray[np.float64],
@@ -101,7 +101,7 @@ def least_times(
     """Least time to any reachable configuration of the goal, from rest to rest.
 
     Args:
-        variant: Whose period, hold and latency count.
+        spec: Whose period, hold and latency count.
         start: Joint angles (7,) in rad.
         goal: Flange position at the goal (3,) in m.
         normal: Outward surface normal (3,).
@@ -117,10 +117,10 @@ def least_times(
         float(travel_time(start, reachable, acceleration_limits=limits).min())
         for limits in (True, False)
     )
-    further = variant.hold_steps - 1 + variant.latency_steps
+    further = spec.hold_steps - 1 + spec.latency_steps
 
     def steps(seconds: float) -> int:
-        return max(1, math.ceil(seconds / variant.control_period_s - 1e-9)) + further
+        return max(1, math.ceil(seconds / spec.control_period_s - 1e-9)) + further
 
     return limited, quick, steps(limited), steps(quick)
 

@@ -144,5 +144,5 @@ def film_one(policy: Path, task: str, scenario: int, film: Path) -> None:
     with hvs_suite.load(task, split="test") as env:
         player = policy_factory(str(policy), task)(env)
         episode, frames = pictures.film_episode(env, player, scenario)
-        pictures.write_film(film, frames, 0.5 / env.variant.control_period_s)
+        pictures.write_film(film, frames, 0.5 / env.spec.control_period_s)
     print(describe(episode, "the demo's policy"))

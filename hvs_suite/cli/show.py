@@ -54,7 +54,7 @@ class Show:
         with hvs_suite.load(self.task, split="test") as env:
             certificate = load_certificate(self.task)
             start, goal = look(env, self.scenario)
-            figure = draw(env.variant, self.scenario, start, goal, certificate)
+            figure = draw(env.spec, self.scenario, start, goal, certificate)
         with replacing(self.out) as temporary:
             figure.savefig(temporary, dpi=DPI, facecolor="white")
         console.print_table(
@@ -102,18 +102,18 @@ def look(env: "Environment", scenario: int) -> tuple[Moment, Moment]:
         last["observation"] = time_step.observation
 
     start = moment("start", env.reset(scenario=scenario).observation)
-    episode = run_episode(env, policy_factory("expert", env.variant.name)(env), scenario, keep)
+    episode = run_episode(env, policy_factory("expert", env.spec.name)(env), scenario, keep)
     how = "goal" if episode.success else "end, not solved"
     return start, moment(f"{how}, step {episode.steps} of the expert", last["observation"])
 
 
 def draw(
-    variant: "Spec", scenario: int, start: Moment, goal: Moment, certificate: "Certificate"
+    spec: "Spec", scenario: int, start: Moment, goal: Moment, certificate: "Certificate"
 ) -> "Figure":
     """Lay out the picture: start above goal, cell and cameras side by side, certificate below.
 
     Args:
-        variant: The task's parameters.
+        spec: The task's parameters.
         scenario: Index that was drawn.
         start: The cell after the reset.
         goal: The cell at the goal.
@@ -124,7 +124,7 @@ def draw(
     """
     from matplotlib.figure import Figure
 
-    words = variant.describe()
+    words = spec.describe()
     table_in = ROW_IN * (len(certificate.checks) + 2)
     head_in, gap_in, edge_in = 1.2, 0.45, 0.25
     height = head_in + 2 * (PANEL_IN + gap_in) + table_in + edge_in
@@ -133,13 +133,13 @@ def draw(
     def put_text(x_in: float, y_in: float, text: str, **style: Any) -> None:
         figure.text(x_in / FIGURE_WIDTH_IN, 1 - y_in / height, text, va="top", **style)
 
-    put_text(edge_in, 0.2, f"{variant.name}-v{variant.version}", size=19, weight="bold", color=INK)
+    put_text(edge_in, 0.2, f"{spec.name}-v{spec.version}", size=19, weight="bold", color=INK)
     put_text(
         edge_in,
         0.62,
         f"to reach: {words.tolerance}"
         + (f", held {words.held}" if words.held else "")
-        + f", within {variant.time_limit_steps} steps of {variant.control_period_s:g} s",
+        + f", within {spec.time_limit_steps} steps of {spec.control_period_s:g} s",
         size=10,
         color=FAINT,
     )

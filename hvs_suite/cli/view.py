@@ -53,7 +53,7 @@ class View:
                 episode = play_in_window(env, policy, self.scenario)
             else:
                 episode, frames = pictures.film_episode(env, policy, self.scenario)
-                pictures.write_film(self.out, frames, 1.0 / env.variant.control_period_s)
+                pictures.write_film(self.out, frames, 1.0 / env.spec.control_period_s)
                 console().print(f"wrote {self.out} ({len(frames)} frames)")
             console().print(describe(episode, self.policy))
 
@@ -102,7 +102,7 @@ def play_in_window(env: "Environment", policy: "Policy", scenario: int) -> "Epis
         def keep_time(*_: object) -> None:
             nonlocal due
             viewer.sync()
-            due += env.variant.control_period_s
+            due += env.spec.control_period_s
             time.sleep(max(0.0, due - time.monotonic()))
 
         episode = run_episode(env, policy, scenario, on_step=keep_time)

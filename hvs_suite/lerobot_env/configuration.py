@@ -47,13 +47,13 @@ class HvsEnvConfig(EnvConfig):
     features_map: dict[str, str] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        variant = self.variant
-        self.fps = round(1.0 / variant.control_period_s)
-        self.features = _features(variant)
+        spec = self.spec
+        self.fps = round(1.0 / spec.control_period_s)
+        self.features = _features(spec)
         self.features_map = {name: name for name in self.features}
 
     @property
-    def variant(self) -> Spec:
+    def spec(self) -> Spec:
         """The task's parameters, options applied.
 
         Raises:
@@ -97,22 +97,22 @@ class HvsEnvConfig(EnvConfig):
         return {self.type: {0: vector}}
 
 
-def _features(variant: Spec) -> dict[str, PolicyFeature]:
+def _features(spec: Spec) -> dict[str, PolicyFeature]:
     """Features by their LeRobot names; image shapes are (H, W, C), as LeRobot asks of environments.
 
     Raises:
         OptionError: The task observes what LeRobot's policies cannot take.
     """
-    names = observation_names(variant.observations)
+    names = observation_names(spec.observations)
     foreign = [name for name in names if name not in _CAMERA_NAMES + _STATE_NAMES]
-    channels = {"eih": variant.eih_channels, "eth": variant.eth_channels}
+    channels = {"eih": spec.eih_channels, "eth": spec.eth_channels}
     grey = [name for name in names if channels.get(name, 3) != 3]
-    if foreign or grey or variant.normalise_observation:
+    if foreign or grey or spec.normalise_observation:
         raise OptionError(
             "LeRobot takes uint8 RGB images and joint values: leave out "
             f"{', '.join(foreign + grey) or 'normalise_observation'}."
         )
-    sides = {"eih": variant.eih_resolution, "eth": variant.eth_resolution}
+    sides = {"eih": spec.eih_resolution, "eth": spec.eth_resolution}
     features = {
         f"{OBS_IMAGES}.{name}": PolicyFeature(FeatureType.VISUAL, (sides[name], sides[name], 3))
         for name in names
@@ -121,6 +121,6 @@ def _features(variant: Spec) -> dict[str, PolicyFeature]:
     joints = _JOINTS * sum(name in _STATE_NAMES for name in names)
     if joints:
         features[OBS_STATE] = PolicyFeature(FeatureType.STATE, (joints,))
-    size = 6 if variant.action_mode == "flange_twist" else _JOINTS
+    size = 6 if spec.action_mode == "flange_twist" else _JOINTS
     features[ACTION] = PolicyFeature(FeatureType.ACTION, (size,))
     return features

@@ -51,7 +51,7 @@ ORDER_STREAM = 4
 def train_eyes(
     base: Path,
     folder: Path,
-    variant: Spec,
+    spec: Spec,
     options: Mapping[str, Any],
     split: str,
     seed: int,
@@ -69,7 +69,7 @@ def train_eyes(
         folder: Gets a folder a round: its frames, the checkpoint that came of it, and
             ``outcome.json`` with the seconds of the sitting that finished it; and
             ``evaluations.json``, of the base and of each round.
-        variant: The named task.
+        spec: The named task.
         options: Task options that differ from it.
         split: Stream of scenes.
         seed: Of the run.
@@ -90,7 +90,7 @@ def train_eyes(
             write_evaluations(results, evaluations)
         return evaluations[number].success_rate
 
-    manifest = Manifest(folder, variant.name, split, options, dataset_features(variant), 0, 0)
+    manifest = Manifest(folder, spec.name, split, options, dataset_features(spec), 0, 0)
     pool: FramePool | None = None
     scene = seed * SCENES_A_SEED + FIRST_SCENE
     best = base

@@ -49,17 +49,17 @@ def privileged_state(environment: Any, error_scale: float) -> npt.NDArray[np.flo
         of the time, steps held, both cameras' targets, the goal's place (m) and normal, and joint
         positions and set point that all actions so far lead to, in units of the joints' limits.
     """
-    truth, info, variant = environment.privileged(), environment.info, environment.variant
+    truth, info, spec = environment.privileged(), environment.info, environment.spec
     rotation, position = kinematics().flange_pose(truth["joint_positions"])
     way = truth["goal_position"] - position
     turn = np.cross(rotation[:, 2], -truth["goal_normal"])
-    left = 1.0 - environment.control_steps / variant.time_limit_steps
+    left = 1.0 - environment.control_steps / spec.time_limit_steps
     coming, _, sent = after_commands(
         environment.joint_positions,
         environment.joint_velocities,
         environment.setpoint,
         environment.pending_setpoints,
-        variant.control_period_s,
+        spec.control_period_s,
     )
     return np.concatenate(
         [
@@ -67,7 +67,7 @@ def privileged_state(environment: Any, error_scale: float) -> npt.NDArray[np.flo
             environment.joint_velocities / JOINT_SPEED_RAD_S,
             np.arcsinh(way / error_scale),
             np.arcsinh(turn / error_scale),
-            [left, info["n_inside"] / variant.hold_steps],
+            [left, info["n_inside"] / spec.hold_steps],
             truth["target_eih"][[2, 3]],
             truth["target_eth"][[2, 3]],
             truth["goal_position"],
@@ -90,7 +90,7 @@ class ResidualStage(gymnasium.Wrapper[Any, Any, Any, Any]):
     tolerance) over the errors that the task bounds, and 0 at the end of an episode.
 
     Args:
-        env: An `hvs_suite.gym.AlignEnv`.
+        env: An `hvs_suite.gym.TaskEnv`.
         checkpoint: The base policy.
         bound: The most that an action adds.
         shaping: Weight of the potential.
@@ -113,7 +113,7 @@ class ResidualStage(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._shaping = shaping
         self._gamma = gamma
         self._environment: Any = env.unwrapped.environment  # type: ignore[attr-defined]
-        self._bounds = self._environment.variant.step_bounds
+        self._bounds = self._environment.spec.step_bounds
         self._memory: torch.Tensor | None = None
         self._out: torch.Tensor | None = None
         self._state: torch.Tensor | None = None

@@ -98,18 +98,18 @@ def finetune(
     """
     settings = settings or Settings()
     options = dict(options or {})
-    variant = find(task).with_options(options)
+    spec = find(task).with_options(options)
     limit = Budget(steps, minutes)
     check_run(seed, split, eval_every, eval_episodes)
     levels = levels_of(task, curriculum) if curriculum is not None else [{}]
-    check_fit(read_config(policy), policy, variant)
+    check_fit(read_config(policy), policy, spec)
     load_base(policy)
     keep_freed_memory()
     torch.set_num_threads(min(2, torch.get_num_threads()))
     identity = {
         "base": weights_digest(policy),
         "task": task,
-        "task_version": variant.version,
+        "task_version": spec.version,
         "options": json.loads(json.dumps(options)),
         "curriculum": curriculum,
         "split": split,
@@ -128,20 +128,18 @@ def finetune(
 
         # Torch and SB3 draw from the global generators of NumPy and torch.
         stack.enter_context(library_seeds(seed))
-        examiner = stack.enter_context(
-            contextlib.closing(Examiner(variant, options, eval_episodes))
-        )
+        examiner = stack.enter_context(contextlib.closing(Examiner(spec, options, eval_episodes)))
 
         def examine(checkpoint: Path, frames: int, updates: int) -> Evaluation:
             return examiner.evaluate(
-                CheckpointPolicy(checkpoint, variant),
+                CheckpointPolicy(checkpoint, spec),
                 frames,
                 updates,
                 on_episode=lambda done: on_eyes("evaluating", done / eval_episodes),
             )
 
         base = train_eyes(
-            policy, training / "eyes", variant, options, split, seed, settings, examine, on_eyes
+            policy, training / "eyes", spec, options, split, seed, settings, examine, on_eyes
         )
         if settings.environments > 1:
             # They and the learner play and learn at the same time.
@@ -149,7 +147,7 @@ def finetune(
         environments = _environments(MakeStage(task, options, levels, split, base, settings, seed))
         stack.callback(environments.close)
         model = _make_model(environments, load_base(base), settings, seed)
-        learner = _Finetuned(model, base, out, variant)
+        learner = _Finetuned(model, base, out, spec)
         run = Run(out, learner, examiner, on_progress)
         stack.callback(run.close)
         run.train(limit, settings.collect_steps, eval_every, checkpoint_period_s)
@@ -209,12 +207,12 @@ class _Finetuned:
 
     guards_success = True
 
-    def __init__(self, model: ResidualTD3, base: Path, out: Path, variant: Spec) -> None:
+    def __init__(self, model: ResidualTD3, base: Path, out: Path, spec: Spec) -> None:
         self.model = model
         self._base = base
         self._out = out
         self._candidate = out / "training" / "candidate"
-        self._variant = variant
+        self._variant = spec
         [hidden, *_] = model.actor.net_arch
         self._network = with_residual(load_base(base), hidden, model.bound)
 

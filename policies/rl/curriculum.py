@@ -42,15 +42,15 @@ def levels_of(task: str, kind: Kind) -> list[dict[str, Any]]:
         UnknownTaskError: There is no such task.
         OptionError: There is no such kind.
     """
-    variant = find(task)
+    spec = find(task)
     if kind == "start":
         return [*({"start": start} for start in STARTS), {}]
     if kind != "tolerance":
         raise OptionError(f"unknown curriculum {kind!r}; use tolerance or start")
     bounds = {
-        field.name: getattr(variant, field.name)
-        for field in dataclasses.fields(variant)
-        if "_tolerance_" in field.name and getattr(variant, field.name) is not None
+        field.name: getattr(spec, field.name)
+        for field in dataclasses.fields(spec)
+        if "_tolerance_" in field.name and getattr(spec, field.name) is not None
     }
     return [{name: factor * b for name, b in bounds.items()} for factor in TOLERANCE_FACTORS]
 
@@ -66,7 +66,7 @@ class Curriculum(gymnasium.Wrapper[Any, Any, Any, Any]):
         levels: Task options of each level, easiest first.
         threshold: Share of the last episodes to solve before the next level, up to 1.
         window: How many those are.
-        **options: Of every level, and ``split`` as `hvs_suite.gym.AlignEnv` takes it.
+        **options: Of every level, and ``split`` as `hvs_suite.gym.TaskEnv` takes it.
 
     Raises:
         UnknownTaskError: There is no such task.

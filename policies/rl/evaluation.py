@@ -68,13 +68,13 @@ class Examiner:
         episodes: Scenes that an evaluation plays.
 
     Args:
-        variant: The named task.
+        spec: The named task.
         options: Task options that differ from it.
         episodes: Scenes to play.
     """
 
-    def __init__(self, variant: Spec, options: Mapping[str, Any], episodes: int) -> None:
-        self._env: Environment = load(variant.name, split=SPLIT, **options)
+    def __init__(self, spec: Spec, options: Mapping[str, Any], episodes: int) -> None:
+        self._env: Environment = load(spec.name, split=SPLIT, **options)
         self.episodes = episodes
 
     def evaluate(
@@ -106,7 +106,7 @@ class Examiner:
                 on_episode(scenario + 1)
         if clip is not None:
             _, frames = film_episode(self._env, policy, 0)
-            write_film(clip, frames, 1.0 / self._env.variant.control_period_s)
+            write_film(clip, frames, 1.0 / self._env.spec.control_period_s)
         return Evaluation(
             env_steps=env_steps,
             updates=updates,

@@ -125,17 +125,17 @@ class Journal(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._actions = []
 
 
-def make_journal(variant: Spec, options: Mapping[str, Any], split: str, seed: int) -> Journal:
+def make_journal(spec: Spec, options: Mapping[str, Any], split: str, seed: int) -> Journal:
     """Makes the Gymnasium environment of a named task, monitored and with a journal.
 
     Args:
-        variant: The named task.
+        spec: The named task.
         options: Task options that differ from it.
         split: Stream of scenes.
         seed: Of the run.
     """
     env = gymnasium.make(
-        f"hvs_suite/{variant.name}-v{variant.version}",
+        f"hvs_suite/{spec.name}-v{spec.version}",
         disable_env_checker=True,
         split=split,
         **options,

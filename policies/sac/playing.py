@@ -34,7 +34,7 @@ class Stage(Protocol):
     """What a checkpoint needs of an environment."""
 
     @property
-    def variant(self) -> Spec:
+    def spec(self) -> Spec:
         """Parameters of the task."""
 
 
@@ -92,7 +92,7 @@ class SacFactory:
         """
         folder = Path(self.folder)
         config = read_config(folder)
-        check_fit(config, folder, env.variant)
+        check_fit(config, folder, env.spec)
         return GreedyActor(_load_actor(folder, config))
 
 
@@ -106,13 +106,13 @@ def is_sac(folder: Path) -> bool:
 
 
 def write_config(
-    folder: Path, variant: Spec, observation_space: spaces.Dict, hidden: tuple[int, ...]
+    folder: Path, spec: Spec, observation_space: spaces.Dict, hidden: tuple[int, ...]
 ) -> None:
     """Write what is needed to make the actor again.
 
     Args:
         folder: The checkpoint.
-        variant: Task that is learnt, its options included.
+        spec: Task that is learnt, its options included.
         observation_space: Images (C, H, W) uint8 and joint inputs (7,) by name.
         hidden: Widths of the dense layers.
     """
@@ -125,8 +125,8 @@ def write_config(
     content = {
         "type": TYPE,
         "format": 1,
-        "task": variant.name,
-        "action_mode": variant.action_mode,
+        "task": spec.name,
+        "action_mode": spec.action_mode,
         "inputs": inputs,
         "hidden": list(hidden),
     }
@@ -168,21 +168,21 @@ def read_config(folder: Path) -> dict[str, Any]:
     return config
 
 
-def check_fit(config: Mapping[str, Any], folder: Path, variant: Spec) -> None:
+def check_fit(config: Mapping[str, Any], folder: Path, spec: Spec) -> None:
     """Check that a task shows what the actor reads, in the same size, and takes its actions.
 
     Args:
         config: As `read_config` returns it.
         folder: The checkpoint, for the message.
-        variant: The task.
+        spec: The task.
 
     Raises:
         PolicyError: It does not fit, or the file is damaged.
     """
-    shown = observation_names(variant.observations)
-    mismatch = f"{folder} does not fit {variant.name}: "
+    shown = observation_names(spec.observations)
+    mismatch = f"{folder} does not fit {spec.name}: "
     try:
-        if variant.normalise_observation or variant.action_mode != config["action_mode"]:
+        if spec.normalise_observation or spec.action_mode != config["action_mode"]:
             raise PolicyError(
                 mismatch + f"it reads raw observations and commands {config['action_mode']}"
             )
@@ -190,8 +190,8 @@ def check_fit(config: Mapping[str, Any], folder: Path, variant: Spec) -> None:
             if name not in shown:
                 raise PolicyError(mismatch + f"it reads {name}, which the task does not show")
             if "shape" in part:
-                side = getattr(variant, f"{name}_resolution")
-                expected = [getattr(variant, f"{name}_channels"), side, side]
+                side = getattr(spec, f"{name}_resolution")
+                expected = [getattr(spec, f"{name}_channels"), side, side]
                 if part["shape"] != expected:
                     raise PolicyError(
                         mismatch + f"it reads {name} as {part['shape']} (channels, rows, columns), "

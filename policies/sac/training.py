@@ -84,15 +84,15 @@ def train_sac(
     """
     settings = settings or Settings()
     options = {**(options or {}), "rewards": tuple(rewards)}
-    variant = find(task).with_options(options)
+    spec = find(task).with_options(options)
     limit = Budget(steps, minutes)
     check_run(seed, split, eval_every, eval_episodes)
-    _check(variant, device)
+    _check(spec, device)
     keep_freed_memory()
     torch.set_num_threads(min(2, torch.get_num_threads()))
     identity = {
         "task": task,
-        "task_version": variant.version,
+        "task_version": spec.version,
         "options": json.loads(json.dumps(options)),
         "split": split,
         "seed": seed,
@@ -104,15 +104,11 @@ def train_sac(
         write_train_config(out, identity, budget, PACKAGES, device=device)
         # SB3 draws from the global generators of NumPy and torch.
         stack.enter_context(library_seeds(seed))
-        journal = stack.enter_context(
-            contextlib.closing(make_journal(variant, options, split, seed))
-        )
+        journal = stack.enter_context(contextlib.closing(make_journal(spec, options, split, seed)))
         model = _make_model(journal, settings, seed, device)
         assert isinstance(model.observation_space, spaces.Dict)
-        write_config(out, variant, model.observation_space, settings.hidden)
-        examiner = stack.enter_context(
-            contextlib.closing(Examiner(variant, options, eval_episodes))
-        )
+        write_config(out, spec, model.observation_space, settings.hidden)
+        examiner = stack.enter_context(contextlib.closing(Examiner(spec, options, eval_episodes)))
         run = Run(out, _Sac(out, model), examiner, on_progress)
         stack.callback(run.close)
         run.train(limit, settings.collect_steps, eval_every, checkpoint_period_s)
@@ -156,9 +152,9 @@ def _make_model(journal: Journal, settings: Settings, seed: int, device: str) ->
     )
 
 
-def _check(variant: Spec, device: str) -> None:
-    others = [name for name in observation_names(variant.observations) if name not in INPUTS]
-    if others or variant.normalise_observation:
+def _check(spec: Spec, device: str) -> None:
+    others = [name for name in observation_names(spec.observations) if name not in INPUTS]
+    if others or spec.normalise_observation:
         raise OptionError(
             f"the network reads {', '.join(INPUTS)}, and normalises them itself; leave out "
             f"{', '.join(others) or 'normalise_observation'}"

@@ -3,7 +3,7 @@
 One file a kind of task; `make_servo` is the one place that knows which family takes which.
 """
 
-from typing import Protocol
+from typing import Any, Protocol
 
 from hvs_suite.errors import PolicyError
 from hvs_suite.rollout import Policy
@@ -14,7 +14,7 @@ class Playground(Protocol):
     """What the policy takes of an environment: the task's parameters, nothing else."""
 
     @property
-    def variant(self) -> Spec:
+    def spec(self) -> Spec:
         """The task's parameters."""
 
 
@@ -28,12 +28,13 @@ def make_servo(env: Playground) -> Policy:
     from hvs_suite.policies.servo.moving_target import MovingTargetServo
     from hvs_suite.policies.servo.still_target import StillTargetServo
 
-    servos = {
+    servos: dict[str, type[Any]] = {
         "align": StillTargetServo,
         "sequence": ChangingTargetServo,
         "track": MovingTargetServo,
     }
-    spec = env.variant
+    spec = env.spec
     if spec.family not in servos:
         raise PolicyError(f"servo does not know tasks of family {spec.family}")
-    return servos[spec.family](spec)
+    servo: Policy = servos[spec.family](spec)
+    return servo

@@ -20,7 +20,7 @@ class ChangingTargetServo(StillTargetServo):
     to be, or when the eye to hand sees one elsewhere.
 
     Args:
-        variant: The task's parameters.
+        spec: The task's parameters.
 
     Raises:
         PolicyError: The task needs what this method does not do.

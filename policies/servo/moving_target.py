@@ -25,15 +25,15 @@ class MovingTargetServo(StillTargetServo):
     """Servoes a moving target; follows :class:`hvs_suite.rollout.Policy`.
 
     Args:
-        variant: The task's parameters.
+        spec: The task's parameters.
 
     Raises:
         PolicyError: The task needs what this method does not do.
     """
 
-    def __init__(self, variant: TrackSpec) -> None:
-        self._spec = variant
-        super().__init__(variant)
+    def __init__(self, spec: TrackSpec) -> None:
+        self._spec = spec
+        super().__init__(spec)
 
     def reset(self) -> None:
         """Forget the last episode."""

@@ -71,7 +71,7 @@ class StillTargetServo:
         max_misses: How often the eye in the hand may miss a target that it should see.
 
     Args:
-        variant: The task's parameters.
+        spec: The task's parameters.
 
     Raises:
         PolicyError: The task needs what this method does not do.
@@ -79,24 +79,24 @@ class StillTargetServo:
 
     max_misses = 6
 
-    def __init__(self, variant: PlacingSpec) -> None:
-        _check(variant)
-        self._variant = variant
+    def __init__(self, spec: PlacingSpec) -> None:
+        _check(spec)
+        self._variant = spec
         self._kinematics = kinematics()
-        self._belief = Belief(variant.control_period_s)
-        self._planner = Planner(variant.control_period_s)
-        self._sight = Sight(variant.target_diameter_m, variant.ring_m)
-        self._search = TargetSearch(self._kinematics, variant.ring_m, variant.target_diameter_m)
-        names = observation_names(variant.observations)
+        self._belief = Belief(spec.control_period_s)
+        self._planner = Planner(spec.control_period_s)
+        self._sight = Sight(spec.target_diameter_m, spec.ring_m)
+        self._search = TargetSearch(self._kinematics, spec.ring_m, spec.target_diameter_m)
+        names = observation_names(spec.observations)
         self._has_eih, self._has_eth = "eih" in names, "eth" in names
-        self._eih_K = intrinsics(variant.eih_resolution, variant.eih_fov_deg)
-        self._eth_K = intrinsics(variant.eth_resolution, variant.eth_fov_deg)
+        self._eih_K = intrinsics(spec.eih_resolution, spec.eih_fov_deg)
+        self._eth_K = intrinsics(spec.eth_resolution, spec.eth_fov_deg)
         self._eth_T = extrinsics(
-            np.array(variant.eth_position_m),
-            look_at(variant.eth_position_m, variant.eth_look_at_m),
+            np.array(spec.eth_position_m),
+            look_at(spec.eth_position_m, spec.eth_look_at_m),
         )
-        self._eth_sigma_m = _calibration_sigma(variant)
-        self._half_view = float(np.tan(np.radians(variant.eih_fov_deg) / 2.0)) * _VIEW_SHARE
+        self._eth_sigma_m = _calibration_sigma(spec)
+        self._half_view = float(np.tan(np.radians(spec.eih_fov_deg) / 2.0)) * _VIEW_SHARE
         self.reset()
 
     def reset(self) -> None:
@@ -273,26 +273,26 @@ def within_reach(goal: FloatArray) -> FloatArray:
     return np.array([goal[0] * scale, goal[1] * scale, goal[2]])
 
 
-def _calibration_sigma(variant: PlacingSpec) -> float:
+def _calibration_sigma(spec: PlacingSpec) -> float:
     """What the published accuracy of the eye-to-hand calibration means on the surface (m)."""
-    distance = float(np.linalg.norm(np.subtract(variant.eth_position_m, variant.eth_look_at_m)))
-    turn = np.radians(variant.eth_rotation_noise_deg)
-    return float(np.hypot(variant.eth_position_noise_m, distance * turn))
+    distance = float(np.linalg.norm(np.subtract(spec.eth_position_m, spec.eth_look_at_m)))
+    turn = np.radians(spec.eth_rotation_noise_deg)
+    return float(np.hypot(spec.eth_position_noise_m, distance * turn))
 
 
-def _check(variant: PlacingSpec) -> None:
+def _check(spec: PlacingSpec) -> None:
     """Refuse what the method does not do, in a sentence."""
-    names = observation_names(variant.observations)
+    names = observation_names(spec.observations)
     if not {"eih", "eth"} & set(names) or not {"joint_positions", "joint_velocities"} <= set(names):
         raise PolicyError(
             "servo needs a camera, joint_positions and joint_velocities; use the preset 'vision'"
         )
-    if variant.normalise_observation or variant.action_mode != "joint_position":
+    if spec.normalise_observation or spec.action_mode != "joint_position":
         raise PolicyError("servo takes raw observations and commands joint positions")
     if any(
         name in names and channels != 3
-        for name, channels in (("eih", variant.eih_channels), ("eth", variant.eth_channels))
+        for name, channels in (("eih", spec.eih_channels), ("eth", spec.eth_channels))
     ):
         raise PolicyError("servo tells the target by its colour; use cameras with 3 channels")
-    if getattr(variant, "surface", "flat") != "flat" or variant.marker != "disc":
+    if getattr(spec, "surface", "flat") != "flat" or spec.marker != "disc":
         raise PolicyError("servo knows discs on flat surfaces alone")

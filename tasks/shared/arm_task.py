@@ -108,6 +108,7 @@ class ArmTask(composer.Task):
         self._reward_terms: dict[str, float] = {}
         self._n_inside = 0
         self._inside_once = False
+        self._steps_to_goal: int | None = None
         self._clear_outcome()
 
     # --- composer -------------------------------------------------------------------------------
@@ -514,7 +515,7 @@ class ArmTask(composer.Task):
         self._n_clipped = 0
         self._inside_once = False
         self._success = False
-        self._steps_to_goal: int | None = None
+        self._steps_to_goal = None
         self._collision = False
         self._truncated = False
         self._reward_terms = {}

@@ -28,6 +28,7 @@ from hvs_suite.tasks.shared.start import steps_lower_bound
 
 if TYPE_CHECKING:
     from hvs_suite.tasks.shared.environment import Environment
+    from hvs_suite.tasks.shared.placing import PlacingSpec
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -132,7 +133,7 @@ def check_geometry(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
     Returns:
         Checks of the joint margin and of the steps that the fastest motion takes.
     """
-    spec = env.variant
+    spec = env.spec
     margins, bounds = [], []
     env.draws = False
     for index in scenarios:
@@ -154,7 +155,10 @@ def check_geometry(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
 
 
 def check_legs(
-    env: "Environment", scenarios: Iterable[int], targets: Callable[[Any], FloatArray]
+    env: "Environment",
+    scenarios: Iterable[int],
+    targets: Callable[[Any], FloatArray],
+    leg_steps: int,
 ) -> list[Check]:
     """Is every one of several targets reachable with margin, and in time from the one before?
 
@@ -164,11 +168,12 @@ def check_legs(
         env: The named task, a family of `Placing` with targets on the level surface.
         scenarios: Indices to check.
         targets: Centres of a scenario's targets in their order, (n, 3) m.
+        leg_steps: Control steps that there are for each of them.
 
     Returns:
         Checks of the joint margin, of the slowest leg and of their sum.
     """
-    spec, family = env.variant, env.task.family
+    spec, family = env.spec, env.task.family
     margins, legs, sums = [], [], []
     for index in scenarios:
         scenario = env.task.source.draw(index)
@@ -196,8 +201,8 @@ def check_legs(
         Check(
             "in time: steps of the slowest leg at its fastest, hold and latency included",
             f"mean {np.mean(legs):.1f}, max {max(legs)}",
-            f"<= {spec.target_steps}",
-            max(legs) <= spec.target_steps,
+            f"<= {leg_steps}",
+            max(legs) <= leg_steps,
         ),
         Check(
             "in time: steps of all legs at their fastest",
@@ -221,7 +226,7 @@ def check_path(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
     Returns:
         Checks of the joint margin along the path, of the joint speeds and of the time to get there.
     """
-    spec, model = env.variant, kinematics()
+    spec, model = env.spec, kinematics()
     margins, shares, bounds = [], [], []
     env.draws = False
     for index in scenarios:
@@ -294,7 +299,7 @@ def check_visibility(env: "Environment", scenarios: Iterable[int]) -> list[Check
         Checks of the rendered footprint in ETH, of a detection test under the task's own noise,
         of the share of scenes that start hidden, and of looking first and then going.
     """
-    spec = env.variant
+    spec = env.spec
     footprints, misses, hidden, look_bounds, n = [], [], 0, [], 0
     for index in scenarios:
         n += 1
@@ -355,13 +360,13 @@ def check_accuracy(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
     diameter (height = focal length * diameter / apparent diameter), whichever is better.
 
     Args:
-        env: The named task.
+        env: The named task, of a family of `Placing`.
         scenarios: Indices to check.
 
     Returns:
         One check for each tolerance of the task.
     """
-    spec = env.variant
+    spec: PlacingSpec = env.task.family.spec
     rows = np.array([_errors_at_goal(env, index) for index in scenarios])
     # Who measures a diameter calibrates it: what the median is off by is no error.
     rows[:, 2] = np.abs(rows[:, 2] - np.median(rows[:, 2]))
@@ -406,7 +411,7 @@ def solved_check(n_success: int, n_collision: int, n: int, mean_steps: float) ->
 
 def _steps_look_and_go(env: "Environment") -> int:
     """Least steps to a posture from which a camera sees the target, and on to the goal."""
-    spec, scenario, goal = env.variant, env.scenario, env.task.goal()
+    spec, scenario, goal = env.spec, env.scenario, env.task.goal()
     best = 10**6
     for lean in _LOOK_LEAN_RAD:
         for turn in np.arange(_LOOK_TURNS) * 2.0 * math.pi / _LOOK_TURNS:

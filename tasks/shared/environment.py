@@ -205,11 +205,6 @@ class Environment(composer.Environment):
         return self._arm.spec
 
     @property
-    def variant(self) -> Spec:
-        """The task's parameters."""
-        return self._arm.spec
-
-    @property
     def split(self) -> str:
         """Name of the stream of scenarios."""
         return self._arm.source.split

@@ -77,11 +77,12 @@ class Scenario(Look):
 
     def digest(self) -> str:
         """SHA-256 of all values, rounded so that the last bits of a processor do not matter."""
-        values = {
-            name: np.round(value, 9).tolist() if isinstance(value, np.ndarray) else value
-            for name, value in dataclasses.asdict(self).items()
-        }
-        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+        text = json.dumps(dataclasses.asdict(self), sort_keys=True, default=_rounded)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _rounded(array: FloatArray) -> Any:
+    return np.round(array, 9).tolist()
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,7 +13,7 @@ import types
 import typing
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared.metric import Metric
@@ -58,7 +58,7 @@ def scene[T](default: T) -> T:
     Args:
         default: The field's default.
     """
-    return cast(T, dataclasses.field(default=default, metadata={_SHAPES_SCENE: True}))
+    return dataclasses.field(default=default, metadata={_SHAPES_SCENE: True})
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

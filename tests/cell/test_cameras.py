@@ -42,7 +42,7 @@ def outline(env: Environment, name: str) -> FloatArray:
     turns = np.linspace(0.0, 2.0 * np.pi, 720, endpoint=False)
     rim = np.stack([np.cos(turns), np.sin(turns)], axis=1) @ across
     centre = scenario.target + scenario.normal * 2.0 * HALF_THICKNESS_M
-    points = centre + rim * env.variant.target_diameter_m / 2.0
+    points = centre + rim * env.spec.target_diameter_m / 2.0
     return cameras.project(points, camera.K, camera.T(env.physics.data.ptr))[:, :2]
 
 
@@ -93,7 +93,7 @@ def test_the_projected_target_lies_where_eye_in_hand_shows_it(
     named: Named, magnify: Callable[[Environment], Renderer], task: str, n: int
 ) -> None:
     env = named(task)
-    radius = env.variant.target_diameter_m / 2.0
+    radius = env.spec.target_diameter_m / 2.0
     found = []
     for index in range(n):
         env.reset(scenario=index)
@@ -135,7 +135,7 @@ def test_the_whole_target_is_in_view_at_the_goal_with_margin(named: Named, task:
     for index in range(3):
         env.reset(scenario=index)
         env.task.place(env.physics, goal_posture(env))
-        polygon, side = outline(env, "eih"), env.variant.eih_resolution
+        polygon, side = outline(env, "eih"), env.spec.eih_resolution
         assert polygon.min() > 0.05 * side
         assert polygon.max() < 0.95 * side
 
@@ -144,7 +144,7 @@ def test_the_whole_target_is_in_view_at_the_goal_with_margin(named: Named, task:
 def test_eye_to_hand_sees_the_whole_ring(named: Named, task: str) -> None:
     """Even where the variant turns the camera by the most that it may."""
     env = named(task)
-    radius = env.variant.ring_m[1] + env.variant.target_diameter_m / 2.0
+    radius = env.spec.ring_m[1] + env.spec.target_diameter_m / 2.0
     turns = np.linspace(0.0, 2.0 * np.pi, 90)
     rim = np.stack([radius * np.cos(turns), radius * np.sin(turns), np.zeros(90)], axis=1)
     for index in range(10):
@@ -156,12 +156,12 @@ def test_eye_to_hand_sees_the_whole_ring(named: Named, task: str) -> None:
 
 
 def test_eye_to_hand_looks_down_from_above_and_from_the_side() -> None:
-    for variant in hvs_suite.TASKS.values():
-        way = np.subtract(variant.eth_position_m, variant.eth_look_at_m)
+    for spec in hvs_suite.TASKS.values():
+        way = np.subtract(spec.eth_position_m, spec.eth_look_at_m)
         elevation = np.rad2deg(np.arctan2(way[2], np.hypot(way[0], way[1])))
         assert 55 < elevation < 75
         assert 2.5 < np.linalg.norm(way) < 3.1
-        assert abs(variant.eth_position_m[1]) > 0.5
+        assert abs(spec.eth_position_m[1]) > 0.5
 
 
 def test_the_tool_axis_is_the_eye_in_hand_s_optical_axis(named: Named) -> None:
@@ -231,10 +231,10 @@ def test_depth_is_the_distance_along_the_optical_axis() -> None:
 def test_a_disturbed_eye_to_hand_moves_truly_but_not_in_what_is_published(named: Named) -> None:
     env = named("align-hard")
     nominal = cameras.extrinsics(
-        np.array(env.variant.eth_position_m),
-        cameras.look_at(env.variant.eth_position_m, env.variant.eth_look_at_m),
+        np.array(env.spec.eth_position_m),
+        cameras.look_at(env.spec.eth_position_m, env.spec.eth_look_at_m),
     )
-    K = cameras.intrinsics(env.variant.eth_resolution, env.variant.eth_fov_deg)
+    K = cameras.intrinsics(env.spec.eth_resolution, env.spec.eth_fov_deg)
     shifts, turns = [], []
     for index in range(40):
         env.reset(scenario=index)
@@ -244,7 +244,7 @@ def test_a_disturbed_eye_to_hand_moves_truly_but_not_in_what_is_published(named:
         scenario = env.scenario
         position = -true[:3, :3].T @ true[:3, 3]
         np.testing.assert_allclose(
-            position, env.variant.eth_position_m + scenario.eth_shift, atol=1e-9
+            position, env.spec.eth_position_m + scenario.eth_shift, atol=1e-9
         )
         turn = true[:3, :3].T @ nominal[:3, :3]
         angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
@@ -261,8 +261,8 @@ def test_an_undisturbed_eye_to_hand_stands_where_the_variant_says(named: Named) 
     env.reset(scenario=0)
     true = env.task.cameras["eth"].T(env.physics.data.ptr)
     nominal = cameras.extrinsics(
-        np.array(env.variant.eth_position_m),
-        cameras.look_at(env.variant.eth_position_m, env.variant.eth_look_at_m),
+        np.array(env.spec.eth_position_m),
+        cameras.look_at(env.spec.eth_position_m, env.spec.eth_look_at_m),
     )
     np.testing.assert_allclose(true, nominal, atol=1e-9)
 
@@ -311,7 +311,7 @@ def test_the_arm_hides_the_target_from_eye_to_hand_but_not_from_eye_in_hand() ->
         assert seen["target_eih"][3] == 1.0
         assert seen["target_eth"][3] == 0.0
         np.testing.assert_allclose(seen["target_eih"][:2], 0.0, atol=1e-3)
-        expected = 0.05 / 0.05 / (2.0 * np.tan(np.deg2rad(env.variant.eih_fov_deg / 2.0)))
+        expected = 0.05 / 0.05 / (2.0 * np.tan(np.deg2rad(env.spec.eih_fov_deg / 2.0)))
         assert seen["target_eih"][2] == pytest.approx(expected, rel=0.02)
 
 

@@ -61,7 +61,7 @@ class _Contract(test_utils.EnvironmentTestMixin):  # type: ignore[misc]  # dm_en
         return hvs_suite.load(self.task)
 
     def make_action_sequence(self) -> Iterator[npt.NDArray[np.float32]]:
-        for _ in range(self.environment.variant.time_limit_steps + 2):
+        for _ in range(self.environment.spec.time_limit_steps + 2):
             yield np.zeros(7, np.float32)
 
 
@@ -226,14 +226,14 @@ def test_pictures_drawn_later_are_those_that_were_observed(task: str) -> None:
 @pytest.mark.parametrize("task", hvs_suite.TASKS)
 def test_doing_nothing_is_truncated_after_exactly_the_tasks_steps(named: Named, task: str) -> None:
     env = named(task, "state")
-    limit = env.variant.time_limit_steps
+    limit = env.spec.time_limit_steps
     env.reset(scenario=0)
     for n in range(1, limit + 1):
         time_step = env.step(env.commandable(env.scenario.start))
         assert env.control_steps == env.info["steps"] == n
-        assert time_step.discount == env.variant.discount
+        assert time_step.discount == env.spec.discount
         assert time_step.last() == env.info["truncated"] == (n == limit)
-    assert env.physics.data.time == pytest.approx(limit * env.variant.control_period_s)
+    assert env.physics.data.time == pytest.approx(limit * env.spec.control_period_s)
     assert not env.info["is_success"]
     assert not env.info["collision"]
     assert env.step(env.commandable(np.zeros(7))).step_type is StepType.FIRST
@@ -249,7 +249,7 @@ def test_truncation_keeps_the_discount_that_was_asked_for() -> None:
 
 def first_contact(env: Environment, action: npt.NDArray[np.float32]) -> int | None:
     """Physics substep, from 1, in which a plain MuJoCo loop first meets a contact."""
-    period = env.variant.control_period_s
+    period = env.spec.control_period_s
     model, data = env.physics.model.ptr, mujoco.MjData(env.physics.model.ptr)
     mujoco.mj_copyData(data, model, env.physics.data.ptr)
     target = action * model.jnt_range[:7, 1]

@@ -142,8 +142,8 @@ def test_the_surface_has_the_size_that_was_asked_for() -> None:
 
 def test_named_tasks_keep_the_edges_of_their_surface_out_of_reach() -> None:
     reach = 0.4 + 0.4 + 0.126
-    for variant in hvs_suite.TASKS.values():
-        assert min(variant.surface_size_m) / 2 > reach
+    for spec in hvs_suite.TASKS.values():
+        assert min(spec.surface_size_m) / 2 > reach
 
 
 def test_targets_never_touch_and_never_move_by_themselves() -> None:

@@ -31,10 +31,10 @@ def test_bound_is_the_scenarios_own():
             env.reset(scenario=scenario)
             truth = env.privileged()
             where = (env.scenario.start, truth["goal_position"], truth["goal_normal"])
-            limited, quick, steps, quick_steps = least_times(env.variant, *where)
-            assert steps == steps_lower_bound(env.variant, *where)
+            limited, quick, steps, quick_steps = least_times(env.spec, *where)
+            assert steps == steps_lower_bound(env.spec, *where)
             assert quick < limited
-            further = env.variant.hold_steps - 1 + env.variant.latency_steps
+            further = env.spec.hold_steps - 1 + env.spec.latency_steps
             assert quick_steps == np.ceil(quick / 0.1) + further
 
 

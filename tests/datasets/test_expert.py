@@ -43,7 +43,7 @@ def test_takes_little_longer_than_the_limits_of_speed_and_acceleration_allow(cou
             steps.append(play(env, expert, scenario)["steps"])
             start, truth = env.scenario.start, env.privileged()
             bounds.append(
-                steps_lower_bound(env.variant, start, truth["goal_position"], truth["goal_normal"])
+                steps_lower_bound(env.spec, start, truth["goal_position"], truth["goal_normal"])
             )
     assert np.mean(steps) <= 1.15 * np.mean(bounds) + 1.0
 

@@ -69,7 +69,7 @@ def play(env: Any, scenario: int, actions: Any) -> trial.Course:
 
 def brought_to_the_bound(env: Any, scenario: int, log: list[Any]) -> int:
     """Turns the base the wrong way, and ends in the step in which the tilt meets its bound."""
-    bound = env.variant.tolerances["tilt_error_deg"]
+    bound = env.spec.tolerances["tilt_error_deg"]
     log[scenario] = log[scenario].copy()
     log[scenario][:, 0] *= -1
 

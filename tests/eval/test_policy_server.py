@@ -149,7 +149,7 @@ def test_a_served_policy_knows_of_the_task_what_it_knows_in_process() -> None:
         _, context = policy_session.served("servo", TASK, message)
         assert context.observations == dict(env.observation_spec())
         assert context.action == env.action_spec()
-        assert context.variant == env.variant
+        assert context.spec == env.spec
 
 
 def test_a_few_lines_make_a_server() -> None:

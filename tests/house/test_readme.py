@@ -37,16 +37,16 @@ def test_the_programs_run(capsys):
 def test_the_table_of_tasks_is_true():
     rows = {row[0]: row for row in table("task")}
     assert list(rows) == list(hvs_suite.TASKS)
-    for task, variant in hvs_suite.TASKS.items():
+    for task, spec in hvs_suite.TASKS.items():
         _, start, target, tolerance, held, steps, _ = rows[task]
-        assert start == variant.start
-        assert f"{1000 * variant.target_diameter_m:g} mm disc" in target
-        assert (int(held), int(steps)) == (variant.hold_steps, variant.time_limit_steps)
+        assert start == spec.start
+        assert f"{1000 * spec.target_diameter_m:g} mm disc" in target
+        assert (int(held), int(steps)) == (spec.hold_steps, spec.time_limit_steps)
         bounds = [
-            variant.position_tolerance_mm,
-            variant.lateral_tolerance_mm,
-            variant.height_tolerance_mm,
-            variant.tilt_tolerance_deg,
+            spec.position_tolerance_mm,
+            spec.lateral_tolerance_mm,
+            spec.height_tolerance_mm,
+            spec.tilt_tolerance_deg,
         ]
         numbers = [float(number) for number in re.findall(r"[\d.]+", tolerance)]
         assert numbers == [bound for bound in bounds if bound is not None]

@@ -20,7 +20,7 @@ def playground(split="test", scenario=0):
     return SimpleNamespace(
         info={"split": split, "scenario": scenario},
         action_spec=lambda: SimpleNamespace(shape=(7,)),
-        variant=TASKS["align-easy"],
+        spec=TASKS["align-easy"],
     )
 
 
@@ -114,9 +114,9 @@ def test_a_folder_that_is_no_checkpoint_is_refused(tmp_path):
     ],
 )
 def test_a_checkpoint_that_does_not_fit_is_refused(checkpoint, change, reason):
-    variant = dataclasses.replace(TASKS["align-easy"], **change)
+    spec = dataclasses.replace(TASKS["align-easy"], **change)
     with pytest.raises(PolicyError, match=reason):
-        CheckpointPolicy(checkpoint, variant)
+        CheckpointPolicy(checkpoint, spec)
 
 
 def test_a_damaged_checkpoint_is_refused(checkpoint, tmp_path):

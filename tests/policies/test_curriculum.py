@@ -50,10 +50,10 @@ def test_success_leads_to_the_next_level_and_failure_does_not():
     assert give_up(env, 0)["level"] == 0
     assert give_up(env, 1)["level"] == 0
     assert play(env, 2)["level"] == 0
-    assert env.unwrapped.environment.variant.position_tolerance_mm == 2.0
+    assert env.unwrapped.environment.spec.position_tolerance_mm == 2.0
     # One of the last two was solved, which is half.
     assert play(env, 3)["level"] == 1
-    assert env.unwrapped.environment.variant.position_tolerance_mm == 1.0
+    assert env.unwrapped.environment.spec.position_tolerance_mm == 1.0
     play(env, 4)
     assert play(env, 5)["level"] == 1  # the last one
     env.close()

@@ -18,7 +18,7 @@ from hvs_suite.cli.finetune import Finetune
 from hvs_suite.cli.main import run
 from hvs_suite.datasets.expert import Expert
 from hvs_suite.errors import OptionError, PolicyError
-from hvs_suite.gym import AlignEnv
+from hvs_suite.gym import TaskEnv
 from hvs_suite.policies.checkpoint import CheckpointPolicy
 from hvs_suite.policies.finetune.folding import load_base, with_residual, write_folded
 from hvs_suite.policies.finetune.outlook import Outlook
@@ -93,7 +93,7 @@ def whole(base, tmp_path_factory):
 @pytest.fixture
 def stage(base):
     """The environment of fine-tuning, on scenes of its own."""
-    env = AlignEnv("align-easy", split="train", **OPTIONS)
+    env = TaskEnv("align-easy", split="train", **OPTIONS)
     with_base = ResidualStage(env, base, bound=0.6, shaping=0.1, gamma=0.9)
     yield with_base
     with_base.close()
@@ -102,7 +102,7 @@ def stage(base):
 def played(folder, options=OPTIONS):
     """Actions of the first scene of `dev`."""
     with hvs_suite.load("align-easy", split="dev", **options) as env:
-        return run_episode(env, CheckpointPolicy(folder, env.variant), 0).actions
+        return run_episode(env, CheckpointPolicy(folder, env.spec), 0).actions
 
 
 def sent(folder):
@@ -146,7 +146,7 @@ def test_a_residual_holds_an_arm_back_that_the_base_wants_to_go_faster_than_join
 
 
 def test_the_action_zero_plays_the_base(base):
-    own = AlignEnv("align-easy", split="dev", **OPTIONS)
+    own = TaskEnv("align-easy", split="dev", **OPTIONS)
     dev = ResidualStage(own, base, bound=0.6, shaping=0.0, gamma=0.9)
     dev.reset(options={"scenario": 0})
     with hvs_suite.load("align-easy", split="dev", **OPTIONS) as env:
@@ -161,7 +161,7 @@ def test_the_action_zero_plays_the_base(base):
 def test_shaping_changes_no_return_but_by_where_it_began(stage):
     """Discounted, a potential that is 0 at the end adds up to minus its beginning."""
     _, info = stage.reset(options={"scenario": 5})
-    bounds = stage.unwrapped.environment.variant.tolerances
+    bounds = stage.unwrapped.environment.spec.tolerances
     first = 0.1 * sum(np.arcsinh(info[name] / bound) for name, bound in bounds.items())
     total, discount, over = 0.0, 1.0, False
     while not over:
@@ -203,7 +203,7 @@ def test_the_actor_knows_nothing_privileged(stage, base):
 )
 def test_critics_see_where_a_command_leads(base, latency, from_set_point):
     options = {**OPTIONS, "latency_steps": latency, "time_limit_steps": 9}
-    own = AlignEnv("align-easy", split="dev", **options)
+    own = TaskEnv("align-easy", split="dev", **options)
     dev = ResidualStage(own, base, bound=0.6, shaping=0.0, gamma=0.9)
     network = load_base(base)
     network.shape = dataclasses.replace(network.shape, from_set_point=from_set_point)

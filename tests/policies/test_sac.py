@@ -231,9 +231,9 @@ def test_the_folder_plays_what_the_trained_actor_plays(full_size, named):
     ],
 )
 def test_a_folder_that_does_not_fit_is_refused(full_size, change, reason):
-    variant = dataclasses.replace(TASKS["align-easy"], **change)
+    spec = dataclasses.replace(TASKS["align-easy"], **change)
     with pytest.raises(PolicyError, match=reason):
-        check_fit(read_config(full_size), full_size, variant)
+        check_fit(read_config(full_size), full_size, spec)
 
 
 def test_damaged_folders_are_refused(full_size, tmp_path):

@@ -39,7 +39,7 @@ def env():
 
 def blind(env):
     """The policy as an evaluation builds it: without the environment."""
-    return Blindfolded(policy_factory("servo", env.variant.name))(env)
+    return Blindfolded(policy_factory("servo", env.spec.name))(env)
 
 
 def test_it_solves_the_thesis_task_within_a_step_of_what_the_motion_takes(env):
@@ -81,10 +81,10 @@ def test_it_solves_disturbed_tasks_and_is_told_no_disturbance(task, scenario, mo
         assert episode.success
         # The same decisions with everything private locked away and another's word for the rest:
         # the accuracy of the calibration is published, what an episode draws from it is not.
-        variant = dataclasses.replace(
-            env.variant, latency_steps=0, joint_offset_deg=0.0, image_noise=0.0, vary_light=False
+        spec = dataclasses.replace(
+            env.spec, latency_steps=0, joint_offset_deg=0.0, image_noise=0.0, vary_light=False
         )
-        context = PolicyContext(variant, {}, None, variant.control_period_s)
+        context = PolicyContext(spec, {}, None, spec.control_period_s)
         policy = make_servo(context)
 
         def locked():
@@ -105,15 +105,15 @@ def test_a_target_at_the_edge_of_reach_is_not_given_up():
 @pytest.mark.parametrize("latency", [1, 2])
 def test_it_copes_with_latency_that_it_is_not_told(latency):
     with hvs_suite.load("align-thesis", split=SPLIT, latency_steps=latency) as env:
-        told_nothing = dataclasses.replace(env.variant, latency_steps=0)
-        policy = make_servo(PolicyContext(told_nothing, {}, None, env.variant.control_period_s))
+        told_nothing = dataclasses.replace(env.spec, latency_steps=0)
+        policy = make_servo(PolicyContext(told_nothing, {}, None, env.spec.control_period_s))
         assert all(run_episode(env, policy, scenario).success for scenario in range(2))
 
 
 @pytest.mark.parametrize("latency", [0, 1, 2])
 def test_latency_shows_in_when_the_arm_first_moves(latency):
     belief = Belief(TASKS["align-thesis"])
-    step = JOINT_SPEED_RAD_S * belief.variant.control_period_s
+    step = JOINT_SPEED_RAD_S * belief.spec.control_period_s
     position, set_points = np.zeros(7), []
     for n in range(5):
         belief.measure(position, np.zeros(7))
@@ -139,9 +139,9 @@ def test_latency_shows_in_when_the_arm_first_moves(latency):
     ],
 )
 def test_what_the_method_cannot_do_is_refused_in_one_line(options, reason):
-    variant = TASKS["align-thesis"].with_options(options)
+    spec = TASKS["align-thesis"].with_options(options)
     with pytest.raises(PolicyError, match=reason) as error:
-        make_servo(PolicyContext(variant, {}, None, 0.1))
+        make_servo(PolicyContext(spec, {}, None, 0.1))
     assert "\n" not in str(error.value)
 
 
@@ -154,12 +154,12 @@ def test_one_camera_alone_will_do(camera):
         assert run_episode(env, blind(env), 0).success
 
 
-def eth(variant):
+def eth(spec):
     """Intrinsics (3, 3) and nominal extrinsics (4, 4) of the eye-to-hand camera."""
-    pose = look_at(variant.eth_position_m, variant.eth_look_at_m)
+    pose = look_at(spec.eth_position_m, spec.eth_look_at_m)
     return (
-        intrinsics(variant.eth_resolution, variant.eth_fov_deg),
-        extrinsics(np.array(variant.eth_position_m), pose),
+        intrinsics(spec.eth_resolution, spec.eth_fov_deg),
+        extrinsics(np.array(spec.eth_position_m), pose),
     )
 
 
@@ -206,15 +206,15 @@ def test_one_wild_sighting_is_ignored_and_a_lasting_one_believed():
 
 
 def test_a_search_rules_out_what_a_camera_saw_and_keeps_what_the_arm_hides():
-    variant = TASKS["align-thesis"]
-    search = TargetSearch(kinematics(), variant.ring_m, variant.target_diameter_m)
+    spec = TASKS["align-thesis"]
+    search = TargetSearch(kinematics(), spec.ring_m, spec.target_diameter_m)
     everywhere = search.possible
-    K, T = eth(variant)
-    search.rule_out(np.zeros(7), K, T, variant.eth_resolution, own=False)
+    K, T = eth(spec)
+    search.rule_out(np.zeros(7), K, T, spec.eth_resolution, own=False)
     hidden = search.possible
     assert 0 < len(hidden) < 0.15 * len(everywhere)
     # The upright arm hides what lies behind it; the rest is the border of the picture.
-    eye, at = np.array(variant.eth_position_m[:2]), np.array(variant.eth_look_at_m[:2])
+    eye, at = np.array(spec.eth_position_m[:2]), np.array(spec.eth_look_at_m[:2])
     assert ((hidden[:, :2] @ (eye - at)) < 0).mean() > 0.8
     search.reset()
     assert len(search.possible) == len(everywhere)

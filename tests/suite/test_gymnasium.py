@@ -10,7 +10,7 @@ from gymnasium.utils.env_checker import check_env
 
 import hvs_suite
 from hvs_suite.errors import ActionError, OptionError, ScenarioError, UnknownTaskError
-from hvs_suite.gym import AlignEnv
+from hvs_suite.gym import TaskEnv
 
 TASKS = sorted(hvs_suite.TASKS)
 ERRORS = ("position_error_mm", "lateral_error_mm", "height_error_mm", "tilt_error_deg")
@@ -96,7 +96,7 @@ def test_the_time_limit_truncates_after_exactly_the_tasks_steps(thesis):
 def test_the_goal_terminates():
     from hvs_suite.datasets.expert import make_expert
 
-    env = AlignEnv("align-easy")
+    env = TaskEnv("align-easy")
     env.reset(options={"scenario": 0})
     expert = make_expert(env.environment)
     ended = False
@@ -109,7 +109,7 @@ def test_the_goal_terminates():
 
 
 def test_a_collision_terminates_without_success():
-    env = AlignEnv("align-easy")
+    env = TaskEnv("align-easy")
     env.reset(options={"scenario": 0})
     down = np.array([0, 1, 0, 0, 0, 0, 0], np.float32)
     ended = False
@@ -171,7 +171,7 @@ def test_unknown_scenarios_tasks_and_options_are_refused(thesis):
     with pytest.raises(ScenarioError):
         thesis.reset(options={"scenario": 1000})
     with pytest.raises(UnknownTaskError, match="align-thesis"):
-        AlignEnv("align-thesi")
+        TaskEnv("align-thesi")
     with pytest.raises(OptionError):
         gymnasium.make("hvs_suite/align-easy-v1", no_such_option=1)
     with pytest.raises(gymnasium.error.NameNotFound, match="align-thesis"):
@@ -181,7 +181,7 @@ def test_unknown_scenarios_tasks_and_options_are_refused(thesis):
     with pytest.raises(OptionError, match="both cameras off"):
         gymnasium.make("hvs_suite/align-easy-v1", observations="joint_positions")
     with pytest.raises(gymnasium.error.UnsupportedMode):
-        AlignEnv("align-easy", render_mode="human")
+        TaskEnv("align-easy", render_mode="human")
 
 
 def test_render_draws_the_cell_once_a_step_and_hands_out_copies(thesis):
@@ -202,7 +202,7 @@ def test_observations_share_no_memory(thesis):
 
 
 def test_closing_twice_does_nothing():
-    env = AlignEnv("align-easy")
+    env = TaskEnv("align-easy")
     env.reset(seed=0)
     env.close()
     env.close()
@@ -228,7 +228,7 @@ def test_a_scenario_asked_for_by_index_is_the_same_in_any_worker(task):
         split="test",
         wrappers=[WithPhysics],
     )
-    alone = WithPhysics(AlignEnv(task, split="test"))
+    alone = WithPhysics(TaskEnv(task, split="test"))
     try:
         workers.reset(seed=500)
         workers.step(np.random.default_rng(0).uniform(-0.05, 0.05, (4, 7)).astype(np.float32))

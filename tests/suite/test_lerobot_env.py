@@ -43,9 +43,9 @@ def test_importing_the_package_registers_the_type(package):
 def test_features_follow_from_the_task(package, task):
     from lerobot.envs import env_to_policy_features
 
-    variant = hvs_suite.TASKS[task]
+    spec = hvs_suite.TASKS[task]
     features = env_to_policy_features(package.HvsEnvConfig(task=task))
-    side = variant.eth_resolution
+    side = spec.eth_resolution
     assert features["observation.images.eth"].shape == (3, side, side)
     assert features["observation.state"].shape == (14,)
     assert features["action"].shape == (7,)

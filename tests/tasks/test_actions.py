@@ -105,7 +105,7 @@ def test_a_twist_that_is_too_fast_is_slowed_down_as_a_whole() -> None:
     fast = np.array([0.0, 0.0, 1.0, 0.0, 1.0, -1.0])
     before = env.setpoint
     env.step(fast)
-    speed = (env.setpoint - before) / env.variant.control_period_s
+    speed = (env.setpoint - before) / env.spec.control_period_s
     assert (np.abs(speed) <= JOINT_SPEED_RAD_S * (1 + 1e-9)).all()
     J = kinematics().jacobian(before)
     twist = fast * np.repeat([TWIST_LINEAR_M_S, TWIST_ANGULAR_RAD_S], 3)
@@ -167,7 +167,7 @@ def test_only_drill_answers_late(named: Named, task: str) -> None:
     env.step(env.commandable(env.scenario.start + 0.05))
     moved = np.abs(env.joint_positions - env.scenario.start).max() > 1e-3
     assert moved == (task != "align-drill")
-    assert env.variant.latency_steps == (1 if task == "align-drill" else 0)
+    assert env.spec.latency_steps == (1 if task == "align-drill" else 0)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -179,7 +179,7 @@ def test_no_command_makes_a_joint_faster_than_the_robot(mode: str) -> None:
         if env.step(rng.uniform(-1, 1, MODES[mode])).last():
             break
         step = np.abs(env.setpoint - before)
-        assert (step <= JOINT_SPEED_RAD_S * env.variant.control_period_s * (1 + 1e-9)).all()
+        assert (step <= JOINT_SPEED_RAD_S * env.spec.control_period_s * (1 + 1e-9)).all()
         assert (np.abs(env.setpoint) <= JOINT_RANGE_RAD + 1e-9).all()
         before = env.setpoint
 
@@ -240,7 +240,7 @@ def set_point_speeds(env: Environment, action: npt.NDArray[Any]) -> npt.NDArray[
     speeds, before = [np.zeros(7)], env.setpoint
     while True:
         last = env.step(action).last()
-        speeds.append((env.setpoint - before) / env.variant.control_period_s)
+        speeds.append((env.setpoint - before) / env.spec.control_period_s)
         before = env.setpoint
         if last:
             return np.array(speeds)
@@ -257,7 +257,7 @@ def test_acceleration_limits_hold_and_the_arm_still_arrives() -> None:
     ) as env:
         env.reset(scenario=0)
         speeds = set_point_speeds(env, env.commandable(goal))
-        change = np.abs(np.diff(speeds, axis=0)) / env.variant.control_period_s
+        change = np.abs(np.diff(speeds, axis=0)) / env.spec.control_period_s
         assert (change <= JOINT_ACCELERATION_RAD_S2 * (1 + 1e-6)).all()
         assert (np.abs(speeds) <= JOINT_SPEED_RAD_S * (1 + 1e-9)).all()
         assert env.info["is_success"]
@@ -280,7 +280,7 @@ def test_acceleration_limits_hold_through_changes_of_mind() -> None:
         if n % 3 == 0:
             action = env.commandable(np.array(BENT) + rng.uniform(-0.3, 0.3, 7))
         env.step(action)
-        new = (env.setpoint - before) / env.variant.control_period_s
-        limit = JOINT_ACCELERATION_RAD_S2 * env.variant.control_period_s
+        new = (env.setpoint - before) / env.spec.control_period_s
+        limit = JOINT_ACCELERATION_RAD_S2 * env.spec.control_period_s
         assert (np.abs(new - speed) <= limit * (1 + 1e-6)).all()
         before, speed = env.setpoint, new

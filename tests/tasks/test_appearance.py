@@ -61,7 +61,7 @@ def test_the_target_can_be_found_by_its_colour_under_the_task_s_own_disturbances
         u, v, _, visible = env.task.target_in_image(env.physics, "eth")
         if visible:
             found = find_disc(seen["eth"])
-            true = (np.array([u, v]) + 1) / 2 * env.variant.eth_resolution - 0.5
+            true = (np.array([u, v]) + 1) / 2 * env.spec.eth_resolution - 0.5
             misses.append(np.inf if found is None else np.linalg.norm(found.centre - true))
     assert len(misses) > 15
     assert np.mean(np.array(misses) <= 1.5) >= 0.9

@@ -36,18 +36,18 @@ def test_the_lock_holds_exactly_the_named_tasks() -> None:
 
 
 def test_changing_what_a_name_means_changes_its_digest() -> None:
-    variant = hvs_suite.TASKS["align-easy"]
-    entry = lock.compute_entry(variant)
+    spec = hvs_suite.TASKS["align-easy"]
+    entry = lock.compute_entry(spec)
     for change in (
         {"version": 2},
         {"tilt_tolerance_deg": 4.9},
         {"eth_fov_deg": 31.5},
         {"observations": "eih"},
     ):
-        changed = lock.compute_entry(dataclasses.replace(variant, **change))  # type: ignore[arg-type]
+        changed = lock.compute_entry(dataclasses.replace(spec, **change))  # type: ignore[arg-type]
         assert changed.digest != entry.digest, change
     # What shapes no scene leaves the scenarios, and their digest, as they are.
-    tolerance = lock.compute_entry(dataclasses.replace(variant, tilt_tolerance_deg=4.9))
+    tolerance = lock.compute_entry(dataclasses.replace(spec, tilt_tolerance_deg=4.9))
     assert tolerance.test_scenarios == entry.test_scenarios
 
 
@@ -65,13 +65,13 @@ def test_the_stored_certificate_is_of_this_task_and_every_line_of_it_holds(task:
 
 @pytest.mark.parametrize("task", hvs_suite.TASKS)
 def test_every_tolerance_has_a_line_that_names_the_source_of_the_information(task: str) -> None:
-    variant = hvs_suite.TASKS[task]
+    spec = hvs_suite.TASKS[task]
     lines = [c.what for c in certificate.load_certificate(task).checks]
     tolerances = {
-        "position": variant.position_tolerance_mm,
-        "lateral": variant.lateral_tolerance_mm,
-        "height": variant.height_tolerance_mm,
-        "tilt": variant.tilt_tolerance_deg,
+        "position": spec.position_tolerance_mm,
+        "lateral": spec.lateral_tolerance_mm,
+        "height": spec.height_tolerance_mm,
+        "tilt": spec.tilt_tolerance_deg,
     }
     for name, tolerance in tolerances.items():
         found = [line for line in lines if line.startswith(f"accurate: {name} from ")]

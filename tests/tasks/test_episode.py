@@ -85,7 +85,7 @@ def at_goal(task: str, **options: Any) -> tuple[Environment, np.ndarray[Any, Any
 @pytest.mark.parametrize("task", hvs_suite.TASKS)
 def test_success_comes_at_the_kth_held_step_and_the_reset_does_not_count(task: str) -> None:
     env, stay = at_goal(task)
-    hold = env.variant.hold_steps
+    hold = env.spec.hold_steps
     assert env.info["n_inside"] == 0
     assert not env.info["success_once"]
     for n in range(1, hold + 1):
@@ -142,24 +142,24 @@ def test_driving_to_the_goal_ends_in_the_very_step_that_completes_the_hold(
     named: Named, task: str
 ) -> None:
     env = named(task, "state")
-    variant = env.variant
+    spec = env.spec
     for index in (0, 1):
         env.reset(scenario=index)
         action = env.commandable(goal_posture(env))
         held = 0
-        for n in range(1, variant.time_limit_steps + 1):
+        for n in range(1, spec.time_limit_steps + 1):
             time_step = env.step(action)
             info = env.info
-            length = variant.position_tolerance_mm
-            inside = info["tilt_error_deg"] <= variant.tilt_tolerance_deg and (
+            length = spec.position_tolerance_mm
+            inside = info["tilt_error_deg"] <= spec.tilt_tolerance_deg and (
                 info["position_error_mm"] <= length
                 if length is not None
-                else info["lateral_error_mm"] <= variant.lateral_tolerance_mm
-                and info["height_error_mm"] <= variant.height_tolerance_mm
+                else info["lateral_error_mm"] <= spec.lateral_tolerance_mm
+                and info["height_error_mm"] <= spec.height_tolerance_mm
             )
             held = held + 1 if inside else 0
             assert info["n_inside"] == held
-            assert info["is_success"] == time_step.last() == (held == variant.hold_steps), n
+            assert info["is_success"] == time_step.last() == (held == spec.hold_steps), n
             if time_step.last():
                 break
         assert info["is_success"]

@@ -52,7 +52,7 @@ def test_pictures_have_the_size_of_the_variant(named: Named, task: str) -> None:
     env = named(task)
     seen = env.reset(scenario=0).observation
     for name in ("eih", "eth"):
-        side = getattr(env.variant, f"{name}_resolution")
+        side = getattr(env.spec, f"{name}_resolution")
         assert seen[name].shape == (side, side, 3)
         assert seen[name].dtype == np.uint8
     assert seen["joint_positions"].shape == seen["joint_velocities"].shape == (7,)

@@ -111,8 +111,8 @@ def test_lists_do_for_tuples_as_they_come_from_json() -> None:
     with hvs_suite.load(
         "align-thesis", observations="state", goal=[0.5, 0.2], rewards=["goal", "time"]
     ) as env:
-        assert env.variant.goal == (0.5, 0.2)
-        assert env.variant.rewards == ("goal", "time")
+        assert env.spec.goal == (0.5, 0.2)
+        assert env.spec.rewards == ("goal", "time")
 
 
 def test_joint_limits_of_the_options_are_those_of_the_robot() -> None:
@@ -143,7 +143,7 @@ def test_every_start_goes_with_every_goal(start: str, goal: Any) -> None:
             goals.add(env.privileged()["goal_position"].tobytes())
             if isinstance(goal, tuple):
                 np.testing.assert_allclose(
-                    env.privileged()["goal_position"], [*goal, env.variant.standoff_m]
+                    env.privileged()["goal_position"], [*goal, env.spec.standoff_m]
                 )
         assert len(goals) == (6 if goal in ("random", "places") else 1)
         if start in ("zero", "fixed"):
@@ -171,7 +171,7 @@ def test_the_goal_s_requirements_can_be_changed() -> None:
         assert not env.step(stay).last()
         assert env.step(stay).last()
         assert env.info["is_success"]
-        assert env.variant.instruction().endswith("120 mm above the surface.")
+        assert env.spec.instruction().endswith("120 mm above the surface.")
 
 
 def test_eye_to_hand_stands_where_it_is_told_to() -> None:

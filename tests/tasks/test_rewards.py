@@ -24,7 +24,7 @@ ON_THE_WAY = StepOutcome(
 ALL: tuple[RewardTerm, ...] = (*THESIS_REWARDS, "joint_space", "exponential")
 
 
-def variant(*rewards: RewardTerm, time_limit: str = "soft") -> Spec:
+def spec(*rewards: RewardTerm, time_limit: str = "soft") -> Spec:
     return dataclasses.replace(
         hvs_suite.TASKS["align-thesis"],
         rewards=rewards,
@@ -45,15 +45,15 @@ def test_each_term_switches_alone() -> None:
         "exponential": 0.4 * math.exp(-6.0),
     }
     for name in ALL:
-        terms = reward_terms(variant(name), ON_THE_WAY)
+        terms = reward_terms(spec(name), ON_THE_WAY)
         assert terms == ({name: pytest.approx(values[name])} if name in values else {})
-        assert reward_terms(variant(name), outcome(success=True)) == (
+        assert reward_terms(spec(name), outcome(success=True)) == (
             {"goal": 1.0} if name == "goal" else {}
         )
-        assert reward_terms(variant(name), outcome(collision=True)) == (
+        assert reward_terms(spec(name), outcome(collision=True)) == (
             {"collision": -1.0} if name == "collision" else {}
         )
-    everything = reward_terms(variant(*ALL), ON_THE_WAY)
+    everything = reward_terms(spec(*ALL), ON_THE_WAY)
     assert everything == {name: pytest.approx(value) for name, value in values.items()}
 
 
@@ -72,15 +72,15 @@ def test_the_thesis_s_six_sets_are_there(
     further: tuple[RewardTerm, ...], on_the_way: float
 ) -> None:
     """D.4: goal and collision alone, and with each of five additions."""
-    chosen = variant("goal", "collision", *further)
+    chosen = spec("goal", "collision", *further)
     assert sum(reward_terms(chosen, ON_THE_WAY).values()) == pytest.approx(on_the_way)
     assert sum(reward_terms(chosen, outcome(success=True)).values()) == 1.0
     assert sum(reward_terms(chosen, outcome(collision=True)).values()) == -1.0
 
 
 def test_collision_replaces_everything_and_the_goal_every_shaping() -> None:
-    assert reward_terms(variant(*ALL), outcome(collision=True, success=True)) == {"collision": -1.0}
-    assert reward_terms(variant(*ALL), outcome(success=True)) == {"goal": 1.0}
+    assert reward_terms(spec(*ALL), outcome(collision=True, success=True)) == {"collision": -1.0}
+    assert reward_terms(spec(*ALL), outcome(success=True)) == {"goal": 1.0}
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_collision_replaces_everything_and_the_goal_every_shaping() -> None:
 def test_position_pays_in_full_within_tolerance_and_falls_linearly(
     distance_m: float, share: float
 ) -> None:
-    terms = reward_terms(variant("position"), outcome(distance_m=distance_m))
+    terms = reward_terms(spec("position"), outcome(distance_m=distance_m))
     assert terms["position"] == pytest.approx(0.4 * share)
 
 
@@ -101,13 +101,13 @@ def test_rotation_pays_in_full_within_tolerance_and_falls_linearly(
     tilt_deg: float, share: float
 ) -> None:
     """With A, the angle: the thesis's algorithm prints the length L here."""
-    terms = reward_terms(variant("rotation"), outcome(tilt_deg=tilt_deg))
+    terms = reward_terms(spec("rotation"), outcome(tilt_deg=tilt_deg))
     assert terms["rotation"] == pytest.approx(0.4 * share)
 
 
 def test_exponential_falls_to_one_eth_at_50_mm() -> None:
     at = [
-        reward_terms(variant("exponential"), outcome(distance_m=d))["exponential"]
+        reward_terms(spec("exponential"), outcome(distance_m=d))["exponential"]
         for d in (0.0, 0.05, 0.10)
     ]
     np.testing.assert_allclose(at, 0.4 * np.exp([0, -1, -2]))
@@ -123,10 +123,10 @@ def test_joint_space_measures_the_way_to_the_nearest_goal_posture() -> None:
 
 def test_a_hard_time_limit_costs_the_goal_s_reward_and_a_soft_one_nothing() -> None:
     late = outcome(truncated=True)
-    assert reward_terms(variant(time_limit="soft"), late) == {}
-    assert reward_terms(variant(time_limit="hard"), late) == {"time_limit": -1.0}
-    assert reward_terms(variant(time_limit="hard"), ON_THE_WAY) == {}
-    assert reward_terms(variant("goal", time_limit="hard"), outcome(success=True)) == {"goal": 1.0}
+    assert reward_terms(spec(time_limit="soft"), late) == {}
+    assert reward_terms(spec(time_limit="hard"), late) == {"time_limit": -1.0}
+    assert reward_terms(spec(time_limit="hard"), ON_THE_WAY) == {}
+    assert reward_terms(spec("goal", time_limit="hard"), outcome(success=True)) == {"goal": 1.0}
 
 
 def test_scoring_is_sparse_by_default() -> None:
@@ -142,9 +142,9 @@ def test_the_environment_pays_what_the_formulas_say(task: str) -> None:
         env.reset(scenario=0)
         goal = env.commandable(posture_at(0.6, 0.1, 0.05))
         family = kinematics().goal_configurations([0.6, 0.1, 0.05], [0, 0, 1.0])
-        tolerance = env.variant.position_tolerance_mm or env.variant.lateral_tolerance_mm
+        tolerance = env.spec.position_tolerance_mm or env.spec.lateral_tolerance_mm
         length = 2 * 0.78 - tolerance / 1000
-        angle = 180.0 - env.variant.tilt_tolerance_deg
+        angle = 180.0 - env.spec.tilt_tolerance_deg
         time_step = env.step(goal)
         paid = []
         while not time_step.last():

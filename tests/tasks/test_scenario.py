@@ -18,12 +18,12 @@ from hvs_suite.tasks.shared.environment import Environment
 from hvs_suite.tasks.shared.scenario import ScenarioSource, fixed_places, steps_lower_bound
 
 Named = Callable[..., Environment]
-RANDOM_STARTS = [name for name, variant in hvs_suite.TASKS.items() if variant.start == "random"]
+RANDOM_STARTS = [name for name, spec in hvs_suite.TASKS.items() if spec.start == "random"]
 
 
 def source(task: str, split: str = "test", **options: Any) -> ScenarioSource:
-    variant = with_options(hvs_suite.TASKS[task], options)
-    return ScenarioSource(variant, split, Surface(shape=variant.surface))
+    spec = with_options(hvs_suite.TASKS[task], options)
+    return ScenarioSource(spec, split, Surface(shape=spec.surface))
 
 
 def digests(draws: ScenarioSource, indices: list[int]) -> list[str]:
@@ -85,8 +85,8 @@ def test_tasks_versions_and_splits_have_streams_of_their_own() -> None:
         for task in ("align-easy", "align-thesis", "align-limit")
         for split in ("train", "test", "held-out")
     }
-    variant = dataclasses.replace(hvs_suite.TASKS["align-easy"], version=2)
-    targets["next version"] = tuple(ScenarioSource(variant, "test", Surface()).draw(0).target)
+    spec = dataclasses.replace(hvs_suite.TASKS["align-easy"], version=2)
+    targets["next version"] = tuple(ScenarioSource(spec, "test", Surface()).draw(0).target)
     assert len(set(targets.values())) == len(targets)
 
 
@@ -221,18 +221,18 @@ def test_fixed_places_are_ten_and_taken_by_index() -> None:
 def test_random_starts_are_clear_and_far_from_the_goal_with_time_to_spare(
     task: str, n: int
 ) -> None:
-    variant, draws, model = hvs_suite.TASKS[task], source(task), kinematics()
+    spec, draws, model = hvs_suite.TASKS[task], source(task), kinematics()
     starts = []
     for index in range(n):
         scenario = draws.draw(index)
         q = scenario.start
         starts.append(q)
-        goal = scenario.target + variant.standoff_m * scenario.normal
+        goal = scenario.target + spec.standoff_m * scenario.normal
         assert (np.abs(q) <= 0.8 * JOINT_RANGE_RAD).all()
         assert model.clearance(q) >= 0.05
         assert np.linalg.norm(model.flange_pose(q)[1] - goal) >= 0.10
-        steps = steps_lower_bound(variant, q, goal, scenario.normal)
-        assert steps + 5 <= variant.time_limit_steps
+        steps = steps_lower_bound(spec, q, goal, scenario.normal)
+        assert steps + 5 <= spec.time_limit_steps
     spread = np.ptp(np.array(starts) / JOINT_RANGE_RAD, axis=0)
     assert (spread > 1.2).all()
 
