@@ -44,6 +44,7 @@ class SequenceSpec(PlacingSpec):
     """
 
     family: ClassVar[str] = "sequence"
+    headline: ClassVar[tuple[str, ...]] = (MISSED,)
     plays_on: ClassVar[bool] = False
 
     n_targets: int = scene(5)

@@ -53,6 +53,7 @@ class TrackSpec(PlacingSpec):
     """
 
     family: ClassVar[str] = "track"
+    headline: ClassVar[tuple[str, ...]] = (RMS_POSITION, TIME_INSIDE)
     further_privileged: ClassVar[Mapping[str, tuple[str, ...]]] = {"goal_velocity": ("x", "y", "z")}
     plays_on: ClassVar[bool] = False
 
