@@ -47,3 +47,19 @@ class ResultError(HvsError, ValueError):
 
 class ServerError(HvsError, ConnectionError):
     """A policy server that cannot be reached, breaks off, or speaks another protocol."""
+
+
+def first_line(error: BaseException) -> str:
+    """What an exception of somebody else's code says, as one line.
+
+    Args:
+        error: The exception; it may say nothing, or raise another when it is asked.
+
+    Returns:
+        The first line of its text, or its type's name.
+    """
+    try:
+        lines = str(error).splitlines()
+    except Exception:  # somebody else's __str__ raises anything
+        lines = []
+    return lines[0] if lines else type(error).__name__

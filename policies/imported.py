@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from hvs_suite.errors import PolicyError
+from hvs_suite.errors import HvsError, PolicyError, first_line
 from hvs_suite.policies.context import PolicyContext
 from hvs_suite.rollout import Policy
 
@@ -38,9 +38,19 @@ class ImportedFactory:
         """Builds the policy for an environment.
 
         Raises:
-            PolicyError: The module cannot be imported, or what it makes is no policy.
+            PolicyError: The module cannot be imported, its factory raises, or what it makes is no
+                policy.
         """
-        policy: Any = self.callable()(PolicyContext.of(env))
+        make, context = self.callable(), PolicyContext.of(env)
+        try:
+            policy = make(context)
+        except HvsError:
+            raise
+        except Exception as error:  # somebody else's factory raises anything
+            raise PolicyError(
+                f"{self.module}:{self.factory} raised {type(error).__name__} when it was called "
+                f"with a PolicyContext: {first_line(error)}"
+            ) from error
         for method in ("reset", "select_action"):
             if not callable(getattr(policy, method, None)):
                 raise PolicyError(
@@ -59,8 +69,10 @@ class ImportedFactory:
             sys.path.insert(0, self.folder)
         try:
             module = importlib.import_module(self.module)
-        except Exception as error:  # somebody else's module raises anything
-            raise PolicyError(f"cannot import {self.module}: {error}") from error
+        except (Exception, SystemExit) as error:  # somebody else's module raises anything
+            raise PolicyError(
+                f"cannot import {self.module}: {type(error).__name__}: {first_line(error)}"
+            ) from error
         found = getattr(module, self.factory, None)
         if not callable(found):
             raise PolicyError(f"module {self.module} has no callable {self.factory}")
