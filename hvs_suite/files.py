@@ -27,10 +27,13 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """
     target = Path(path)
     check_writable(target)
-    descriptor, name = tempfile.mkstemp(
-        dir=target.parent, prefix=f".{target.stem}-", suffix=target.suffix
-    )
-    os.close(descriptor)
+    try:
+        descriptor, name = tempfile.mkstemp(
+            dir=target.parent, prefix=f".{target.stem}-", suffix=target.suffix
+        )
+        os.close(descriptor)
+    except OSError as error:
+        raise OutputError(f"cannot write {target}: {error.strerror or error}") from error
     temporary = Path(name)
     try:
         yield temporary

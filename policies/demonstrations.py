@@ -369,7 +369,13 @@ def _read_columns(manifest: Manifest) -> dict[str, Column]:
             column = table.column(key).combine_chunks()
             width = int(manifest.features[key]["shape"][0])
             flat = column.flatten().to_numpy(zero_copy_only=False)
-            parts[key].append(flat.reshape(-1, width).astype(np.float32))
+            values = flat.reshape(-1, width).astype(np.float32)
+            if len(astray := np.flatnonzero(~np.isfinite(values).all(axis=1))):
+                raise DatasetError(
+                    f"{path}: {key} holds NaN or infinity in {len(astray)} rows, row {astray[0]} "
+                    "first; record the dataset again"
+                )
+            parts[key].append(values)
         parts[EPISODE].append(table.column(EPISODE).to_numpy().astype(np.int64))
     columns = {key: np.concatenate(arrays) for key, arrays in parts.items()}
     if len(columns[EPISODE]) != manifest.n_frames:

@@ -5,7 +5,7 @@ import json
 import shutil
 from pathlib import Path
 
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from hvs_suite.errors import PolicyError
 from hvs_suite.files import replacing
@@ -69,6 +69,6 @@ def write_folded(base: Path, network: HvsNetwork, out: Path) -> None:
         for path in base.glob(f"{Path(name).stem}*"):
             shutil.copy(path, out / path.name)
     with replacing(out / "model.safetensors") as temporary:
-        save_file(weights, temporary, {"format": "pt"})
+        temporary.write_bytes(save(weights, {"format": "pt"}))
     with replacing(out / "config.json") as temporary:
         temporary.write_text(json.dumps(config, indent=2, sort_keys=True) + "\n")

@@ -193,11 +193,11 @@ def save_actor(folder: Path, actor: "Actor") -> None:
         folder: The checkpoint.
         actor: On any device.
     """
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     weights = {name: value.cpu().contiguous() for name, value in actor.state_dict().items()}
     with replacing(folder / WEIGHTS) as temporary:
-        save_file(weights, temporary)
+        temporary.write_bytes(save(weights))
 
 
 def read_config(folder: Path) -> Config:
