@@ -3,8 +3,11 @@
 None of these tests imports LeRobot: everything is found before LeRobot would be asked.
 """
 
+import contextlib
+import dataclasses
 import json
 import os
+import pickle
 import resource
 import shutil
 import struct
@@ -16,18 +19,23 @@ from typing import Any
 import huggingface_hub.constants
 import numpy as np
 import pytest
+import torch
 from safetensors.numpy import load_file, save_file
 
 from hvs_suite.cli import main
-from hvs_suite.errors import PolicyError
-from hvs_suite.eval import protocol
-from hvs_suite.policies import imported
+from hvs_suite.errors import HvsError, PolicyError
+from hvs_suite.eval import action_log, protocol
+from hvs_suite.eval.provenance import file_hash
+from hvs_suite.policies import dagger, imported
 from hvs_suite.policies.catalogue import checkpoint_folder, policy_factory
-from hvs_suite.policies.checkpoint_files import read_config
+from hvs_suite.policies.checkpoint_files import read_config, read_shapes
+from hvs_suite.policies.frame_cache import open_frames
+from hvs_suite.policies.training_state import load_state
 from hvs_suite.tasks.variants import TASKS
 
 TASK = "align-easy"
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
+SUMMARY_FIELDS = [field.name for field in dataclasses.fields(dagger.RoundSummary)]
 Damage = Callable[[Path], object]
 
 
@@ -377,6 +385,59 @@ def test_notes_without_a_held_out_loss_are_taken(strange: Path) -> None:
 
 def read_total(folder: Path) -> int:
     return sum(value.size for value in load_file(folder / "model.safetensors").values())
+
+
+class Payload:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, marker: Path) -> None:
+        self._marker = marker
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (Path.touch, (self._marker,))
+
+
+def load_training_state(path: Path) -> None:
+    layer = torch.nn.Linear(1, 1)
+    load_state(path, layer, torch.optim.AdamW(layer.parameters()))
+
+
+def read_shipped(path: Path) -> None:
+    for source in checkpoint_folder("pretrained", TASK).glob("*.json"):
+        shutil.copy(source, path.parent)
+    policy_factory(str(path.parent), TASK)
+
+
+LOADERS: dict[str, tuple[str, Callable[[Path], object]]] = {
+    "weights": ("model.safetensors", read_shipped),
+    "actor": ("model.safetensors", lambda path: read_shapes(path.parent)),
+    "state of a run": ("state.safetensors", load_training_state),
+    "round": (dagger.COLUMNS, lambda path: dagger.read_round(path.parent)),
+    "frames": ("frames.npy", open_frames),
+    "actions": ("log.actions.npz", lambda path: action_log.load(path, file_hash(path))),
+}
+
+
+@pytest.mark.parametrize("loader", LOADERS)
+@pytest.mark.parametrize("form", ["pickle", "torch", "npy", "npz"])
+def test_nothing_unpickles(tmp_path: Path, loader: str, form: str) -> None:
+    name, load = LOADERS[loader]
+    path, marker = tmp_path / name, tmp_path / "marker"
+    with path.open("wb") as file:
+        if form == "pickle":
+            pickle.dump(Payload(marker), file)
+        elif form == "torch":
+            torch.save({"weight": Payload(marker)}, file)
+        elif form == "npy":
+            np.save(file, np.array([Payload(marker)], object), allow_pickle=True)
+        else:
+            np.savez(file, **{f"{n:04d}": np.array([Payload(marker)], object) for n in range(2)})
+    (tmp_path / dagger.SUMMARY).write_text(json.dumps(dict.fromkeys(SUMMARY_FIELDS, 0)))
+    with contextlib.suppress(HvsError, ValueError):
+        load(path)
+    assert not marker.exists()
+    pickle.loads(pickle.dumps(Payload(marker)))  # noqa: S301 - the payload does work
+    assert marker.exists()
 
 
 SAC = {
