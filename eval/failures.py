@@ -22,7 +22,8 @@ from hvs_suite.errors import ResultError
 from hvs_suite.eval import action_log, result_file
 from hvs_suite.eval.result_file import EpisodeRow
 from hvs_suite.names import shown
-from hvs_suite.policies.checkpoint import load_network, network_inputs, read_config
+from hvs_suite.policies.checkpoint import load_network, network_inputs
+from hvs_suite.policies.checkpoint_files import read_config
 from hvs_suite.rollout import Action, Observation, one_torch_thread
 from hvs_suite.tasks.shared.spec import Spec
 

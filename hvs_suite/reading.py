@@ -416,3 +416,46 @@ def _choose_columns(
         for name in wanted
         if any(leaf == name or leaf.startswith(f"{name}.") for leaf in texts)
     ]
+
+
+# The library itself reads headers of up to 100 MB; one of ours takes 5 kB.
+_MOST_HEADER_BYTES = 8 * 2**20
+
+
+def tensor_shapes(
+    path: Path, *, most: int, error: type[HvsError], within: Path | None = None
+) -> dict[str, tuple[int, ...]]:
+    """Read the names and shapes of a ``safetensors`` file's tensors, and none of their numbers.
+
+    Args:
+        path: The file.
+        most: Largest size allowed (bytes).
+        error: Raised where it is not such a file.
+        within: As in `check_regular`.
+
+    Returns:
+        Shape by name. The library has checked that the tensors fill the file exactly, so that what
+        holds these shapes is no larger than the file.
+
+    Raises:
+        HvsError: As `error`: empty, cut short, of a header that is too long, or damaged.
+    """
+    try:
+        from safetensors import SafetensorError, safe_open
+    except ImportError as reason:
+        raise error(f"reading {path} needs safetensors; install hvs-suite[learn]") from reason
+    size = check_regular(path, error=error, within=within, most=most)
+    try:
+        with path.open("rb") as file:
+            length = int.from_bytes(file.read(8), "little")
+        if not 0 < length <= min(_MOST_HEADER_BYTES, size - 8):
+            raise error(f"{path}: is no safetensors file; its header would take {length:,} bytes")
+        with safe_open(path, framework="np") as tensors:
+            return {
+                name: tuple(tensors.get_slice(name).get_shape())
+                for name in tensors.keys()  # noqa: SIM118 - not a dict
+            }
+    except (OSError, ValueError, SafetensorError) as reason:
+        if isinstance(reason, HvsError):
+            raise
+        raise error(f"{path}: is no safetensors file ({_why(reason)})") from reason

@@ -10,18 +10,13 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from hvs_suite.errors import PolicyError
+from hvs_suite.errors import PolicyError, first_line
 from hvs_suite.files import replacing
+from hvs_suite.policies.checkpoint_files import FILES, read_config
 from hvs_suite.policies.training_plot import PICTURE
 
 CARD = "README.md"
 LICENCE = "apache-2.0"
-CHECKPOINT_FILES = (
-    "config.json",
-    "model.safetensors",
-    "policy_preprocessor.json",
-    "policy_postprocessor.json",
-)
 TRAINING_FILES = ("train_config.json", "training/outcome.json", f"training/{PICTURE}")
 
 
@@ -40,11 +35,15 @@ def write_card(folder: Path, results: Iterable[Mapping[str, Any]] = (), command:
         PolicyError: The folder holds no checkpoint of either.
         OutputError: It cannot be written.
     """
-    config, trained, outcome = (
-        _read(folder / name) for name in ("config.json", *TRAINING_FILES[:2])
-    )
-    body = describe(config, trained, outcome, list(results), command)
-    task = trained["settings"]["task"]
+    config = read_config(folder)
+    trained, outcome = (_read(folder / name) for name in TRAINING_FILES[:2])
+    try:
+        body = describe(config, trained, outcome, list(results), command)
+        task = trained["settings"]["task"]
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise PolicyError(
+            f"{folder} holds no finished training run: its notes lack {first_line(error)}"
+        ) from error
     with replacing(folder / CARD) as temporary:
         temporary.write_text(_front_matter(task) + body, encoding="utf-8")
     return body
@@ -58,13 +57,14 @@ def ship(checkpoint: Path, folder: Path) -> None:
         folder: Gets the files; those of the same names are replaced.
 
     Raises:
-        PolicyError: The run is not finished.
+        PolicyError: The run is not finished, or `read_config` refuses its checkpoint.
         OutputError: The folder cannot be written.
     """
-    for name in (*CHECKPOINT_FILES, *TRAINING_FILES):
+    for name in (*FILES, *TRAINING_FILES):
         if not (checkpoint / name).is_file():
             raise PolicyError(f"{checkpoint} lacks {name}; let its training come to its end first")
-    for name in (*CHECKPOINT_FILES, *TRAINING_FILES):
+    read_config(checkpoint)
+    for name in (*FILES, *TRAINING_FILES):
         with replacing(folder / name) as temporary:
             shutil.copyfile(checkpoint / name, temporary)
 

@@ -10,7 +10,8 @@ from torch import nn
 
 from hvs_suite.datasets.features import ACTION_EXECUTED
 from hvs_suite.errors import OptionError, PolicyError
-from hvs_suite.policies.checkpoint import load_network, read_config
+from hvs_suite.policies.checkpoint import load_network
+from hvs_suite.policies.checkpoint_files import read_config
 from hvs_suite.policies.demonstrations import Manifest, calibration_of
 from hvs_suite.policies.hvs.network import IMAGE_PREFIX, STATE, Eye
 from hvs_suite.registry import find

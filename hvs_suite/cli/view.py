@@ -47,8 +47,9 @@ class View:
         if self.out is not None:
             pictures.check_film_suffix(self.out)
             check_writable(self.out)
+        make = policy_factory(self.policy, self.task)
         with hvs_suite.load(self.task, split=self.split) as env:
-            policy = policy_factory(self.policy, self.task)(env)
+            policy = make(env)
             if self.out is None:
                 episode = play_in_window(env, policy, self.scenario)
             else:
