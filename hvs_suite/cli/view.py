@@ -74,9 +74,8 @@ def describe(episode: "Episode", policy: str) -> str:
         how = f"collision in step {episode.steps}"
     else:
         how = f"time is up after {episode.steps} steps"
-    return f"{policy}, scenario {episode.scenario}: {how}; , ".join(
-        f"{name} {value:.2f}" for name, value in episode.errors.items()
-    )
+    errors = ", ".join(f"{name} {value:.2f}" for name, value in episode.errors.items())
+    return f"{policy}, scenario {episode.scenario}: {how}; {errors}"
 
 
 def play_in_window(env: "Environment", policy: "Policy", scenario: int) -> "Episode":
