@@ -1,11 +1,11 @@
 """A result file says what happened, and one that cannot be true is refused with the reason."""
 
-import copy
 import json
 from pathlib import Path
 from typing import Any
 
 import pytest
+from columns import put_rows, rows_of
 
 from hvs_suite.errors import OutputError, ResultError
 from hvs_suite.eval import result_file
@@ -13,9 +13,18 @@ from hvs_suite.eval import result_file
 TOLERANCES = {"position_error_mm": 5.0, "tilt_error_deg": 5.0}
 
 
+METRICS = ("position_error_mm", "lateral_error_mm", "height_error_mm", "tilt_error_deg")
+
+
 def row(scenario: int, *, success: bool, error: float, **changes: Any) -> result_file.EpisodeRow:
+    """A row; ``settled_<name>`` changes what is settled."""
     steps = 10 + scenario
     settled = error / 10 if success else error
+    settled_changes = {
+        name.removeprefix("settled_"): changes.pop(name)
+        for name in list(changes)
+        if name.startswith("settled_")
+    }
     values: dict[str, Any] = {
         "scenario": scenario,
         "success": success,
@@ -25,22 +34,23 @@ def row(scenario: int, *, success: bool, error: float, **changes: Any) -> result
         "steps": steps,
         "steps_to_goal": steps if success else None,
         "n_clipped": scenario,
-        "position_error_mm": error,
-        "lateral_error_mm": error,
-        "height_error_mm": 0.0,
-        "tilt_error_deg": 2 * error,
         "failure": None,
-        "settled_steps": 20 if success else steps,
-        "settled_collision": not success and scenario % 2 == 1,
-        "settled_failure": None,
-        "settled_position_error_mm": settled,
-        "settled_lateral_error_mm": settled,
-        "settled_height_error_mm": 0.0,
-        "settled_tilt_error_deg": 2 * settled,
-        "settled_x_mm": settled,
-        "settled_y_mm": 0.0,
+        "errors": errors(error),
+        "settled": {
+            "steps": 20 if success else steps,
+            "collision": not success and scenario % 2 == 1,
+            "failure": None,
+            "errors": errors(settled),
+            "x_mm": settled,
+            "y_mm": 0.0,
+        }
+        | settled_changes,
     }
-    return result_file.EpisodeRow(**(values | changes))
+    return result_file.EpisodeRow.model_validate(values | changes)
+
+
+def errors(error: float) -> dict[str, float]:
+    return dict(zip(METRICS, (error, error, 0.0, 2 * error), strict=True))
 
 
 def make_result(n: int = 5, **summary: Any) -> result_file.Result:
@@ -66,6 +76,7 @@ def make_result(n: int = 5, **summary: Any) -> result_file.Result:
             training_hours=None,
             decision_limit_s=10.0,
             actions_sha256=64 * "0",
+            n_logged=n,
             packages={"numpy": "2.2.6"},
             gl_renderer="llvmpipe",
             cpu="a processor",
@@ -84,22 +95,23 @@ def test_the_summary_counts_what_the_rows_say() -> None:
     assert summary.pc_success_ci95 == pytest.approx([23.07, 88.24], abs=0.01)
     assert (summary.n_collision, summary.n_clipped) == (1, 10)
     assert summary.steps_to_goal_mean == 11.0
-    assert summary.position_error_mm.p50 == pytest.approx(2 / 3)
-    assert summary.position_error_mm.p95 == pytest.approx(3.8 / 3)
-    assert summary.position_error_mm.iqm == pytest.approx(2 / 3)
-    assert summary.tilt_error_deg.p50 == pytest.approx(4 / 3)
+    assert summary.errors["position_error_mm"].p50 == pytest.approx(2 / 3)
+    assert summary.errors["position_error_mm"].p95 == pytest.approx(3.8 / 3)
+    assert summary.errors["position_error_mm"].iqm == pytest.approx(2 / 3)
+    assert summary.errors["tilt_error_deg"].p50 == pytest.approx(4 / 3)
 
 
 def test_the_settled_figures_are_those_past_the_goal() -> None:
     summary = make_result().summary
-    assert summary.settled_position_error_mm.p50 == pytest.approx(0.2 / 3)
-    assert summary.settled_position_error_mm.p99 > 1.0
-    low, high = summary.settled_position_error_mm.iqm_ci95
-    assert low <= summary.settled_position_error_mm.iqm <= high
+    assert summary.settled.errors["position_error_mm"].p50 == pytest.approx(0.2 / 3)
+    assert summary.settled.errors["position_error_mm"].p99 > 1.0
+    low, high = summary.settled.errors["position_error_mm"].iqm_ci95
+    assert low <= summary.settled.errors["position_error_mm"].iqm <= high
     # The fourth episode collided: no tolerance makes that a success.
-    assert summary.settled_n_lost == 1
-    assert summary.settled_success_by_scale.pc_success[-1] == 80.0
-    assert summary.settled_sharpest_95.scale is None
+    assert summary.settled.n_lost == 1
+    assert summary.settled.success_by_scale is not None
+    assert summary.settled.success_by_scale.pc_success[-1] == 80.0
+    assert summary.settled.sharpest_95.scale is None
 
 
 def test_success_against_steps_ends_at_the_success_rate() -> None:
@@ -125,15 +137,26 @@ def test_a_written_result_reads_back_the_same(tmp_path: Path) -> None:
     assert [file.name for file in path.parent.iterdir()] == ["align-easy.json"]
 
 
-def test_each_row_stands_on_its_own_line_with_the_fixed_keys(tmp_path: Path) -> None:
+def test_each_column_stands_on_its_own_line_and_repeats_nothing(tmp_path: Path) -> None:
     path = tmp_path / "result.json"
     result_file.write(make_result(), path)
-    content = json.loads(path.read_text())
-    keys = "scenario success success_once collision truncated steps steps_to_goal n_clipped"
-    fixed = [*keys.split(), *result_file.ERRORS]
-    assert list(content["episodes"][0])[: len(fixed)] == fixed
-    lines = path.read_text().splitlines()
-    assert json.dumps(content["episodes"][1]) + "," in [line.strip() for line in lines]
+    columns = json.loads(path.read_text())["episodes"]
+    assert columns["success"] == [True, True, True, False, False]
+    assert columns["failure"] is None
+    assert columns["errors"]["height_error_mm"] == 0.0
+    assert "scenario" not in columns
+    assert "failure" not in columns["settled"]
+    lines = [line.strip() for line in path.read_text().splitlines()]
+    assert '"steps": [10,11,12,13,14],' in lines
+
+
+def test_a_task_with_a_tolerance_of_zero_has_no_curve() -> None:
+    rows = [row(0, success=True, error=0.0)]
+    summary = result_file.Summary.of(
+        "t", "p", "test", rows, tolerances={"tilt_error_deg": 0.0}, time_limit_steps=20
+    )
+    assert summary.settled.success_by_scale is None
+    assert summary.settled.sharpest_95.scale is None
 
 
 def test_a_result_cannot_be_written_below_a_file(tmp_path: Path) -> None:
@@ -142,45 +165,59 @@ def test_a_result_cannot_be_written_below_a_file(tmp_path: Path) -> None:
         result_file.write(make_result(), tmp_path / "file" / "result.json")
 
 
+def in_row(index: int, **changes: Any) -> Any:
+    """Changes a row of a file."""
+
+    def tamper(content: Any) -> None:
+        rows = rows_of(content)
+        for name, value in changes.items():
+            if isinstance(value, dict):
+                rows[index][name] |= value
+            else:
+                rows[index][name] = value
+        put_rows(content, rows)
+
+    return tamper
+
+
 BROKEN: dict[str, tuple[Any, str]] = {
     "missing block": (lambda c: c.pop("metadata"), "metadata: Field required"),
     "unknown key": (lambda c: c["summary"].update(extra=1), "summary.extra"),
     "other schema": (lambda c: c.update(schema_version=99), "schema_version is 99"),
     "no schema": (lambda c: c.pop("schema_version"), "schema_version is None"),
-    "no rows": (lambda c: c.update(episodes=[]), "episodes"),
-    "text for a number": (lambda c: c["episodes"][0].update(steps="10"), "episodes.0.steps"),
+    "rows for columns": (lambda c: c.update(episodes=[]), "holds no columns of episodes"),
+    "no rows": (lambda c: c["summary"].update(n_episodes=0), "holds no columns of episodes"),
+    "a billion rows": (
+        lambda c: c["summary"].update(n_episodes=10**9),
+        "holds no columns of episodes",
+    ),
+    "a column that is too short": (
+        lambda c: c["episodes"]["steps"].pop(),
+        "steps holds 4 values for 5 episodes",
+    ),
+    "a column too many": (lambda c: c["episodes"].update(extra=1), "episodes.0.extra"),
+    "text for a number": (in_row(0, steps="10"), "episodes.0.steps"),
     "a negative error": (
-        lambda c: c["episodes"][0].update(tilt_error_deg=-1.0),
-        "episodes.0.tilt_error_deg",
+        in_row(0, errors={"tilt_error_deg": -1.0}),
+        "episodes.0.errors.tilt_error_deg",
     ),
     "an infinite error": (
-        lambda c: c["episodes"][0].update(tilt_error_deg=float("inf")),
+        in_row(0, errors={"tilt_error_deg": float("inf")}),
         "Infinity is no number",
     ),
-    "a scenario twice": (
-        lambda c: c["episodes"].insert(1, copy.deepcopy(c["episodes"][0])),
-        "scenario 0 appears more than once",
-    ),
-    "a scenario left out": (lambda c: c["episodes"].pop(3), "scenarios 0..N-1"),
-    "another order": (lambda c: c["episodes"].reverse(), "in this order"),
-    "a success without its steps": (
-        lambda c: c["episodes"][0].update(steps_to_goal=None),
-        "steps_to_goal must equal",
-    ),
-    "two ends": (
-        lambda c: c["episodes"][0].update(collision=True),
-        "an episode has one end",
-    ),
+    "a success without its steps": (in_row(0, steps_to_goal=None), "null otherwise"),
+    "more steps to the goal than steps": (in_row(0, steps_to_goal=99), "between 1 and steps"),
+    "two ends": (in_row(0, collision=True), "an episode has one end"),
     "a flattered summary": (
         lambda c: c["summary"].update(pc_success=100.0),
         "summary.pc_success is not what the episodes give",
     ),
     "a flattered error": (
-        lambda c: c["summary"]["tilt_error_deg"].update(p95=0.0),
-        "summary.tilt_error_deg is not",
+        lambda c: c["summary"]["errors"]["tilt_error_deg"].update(p95=0.0),
+        "summary.errors is not",
     ),
     "a settled figure that is not the episode's": (
-        lambda c: c["episodes"][4].update(position_error_mm=0.0),
+        in_row(4, errors={"position_error_mm": 0.0}),
         "settled figures must be the episode's own",
     ),
     "another version of a package": (
@@ -190,12 +227,13 @@ BROKEN: dict[str, tuple[Any, str]] = {
     "no seal": (lambda c: c.pop("sha256"), "was changed after it was written"),
     "a bound on nothing": (
         lambda c: c["metadata"].update(tolerances={"yaw": 1.0}),
-        "tolerances.yaw",
+        "bounds what is no metric",
     ),
-    "a flattered row": (
-        lambda c: c["episodes"][2].update(position_error_mm=0.0),
-        "summary.position_error_mm is not",
+    "a log that is too short for a policy of one's own": (
+        lambda c: c["metadata"].update(n_logged=2, policy_kind="module"),
+        "n_logged must be the number of rows",
     ),
+    "a flattered row": (in_row(2, errors={"position_error_mm": 0.0}), "summary.errors is not"),
 }
 
 
