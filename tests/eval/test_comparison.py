@@ -58,8 +58,7 @@ def test_a_clear_difference_is_called_one(tmp_path: Path) -> None:
     assert comparison.compare(b, a).conclusion().startswith("good succeeds more often than poor")
     assert found.steps_to_goal is not None
     assert found.steps_to_goal.n == 25
-    assert found.settled_position_mm is not None
-    assert found.settled_position_mm.high < 0.0
+    assert found.settled["position_error_mm"].high < 0.0
 
 
 def test_what_chance_explains_is_not_called_a_difference(tmp_path: Path) -> None:
