@@ -93,7 +93,7 @@ def test_a_run_that_cannot_write_goes_on_when_it_can(dataset, tmp_path, whole, s
     assert not begun or 3 not in steps
 
 
-@pytest.mark.parametrize("size", ["8k", "250k", "4m"])
+@pytest.mark.parametrize("size", ["8k", "120k", "250k", "4m"])
 def test_a_full_disk_ends_a_run_in_one_line_and_loses_nothing(dataset, disk, whole, size, capfd):
     resize(disk, size)
     out = disk / "run"
