@@ -68,8 +68,8 @@ def test_every_marker_lies_on_every_surface_and_is_seen_from_the_goal(
         above = (body.xpos - scenario.target) @ scenario.normal
         assert 0 < above < 1e-3
         env.task.place(env.physics, goal_posture(env))
-        assert env.info["position_error_mm"] < 1e-6
-        assert env.info["tilt_error_deg"] < 1e-6
+        assert env.info["errors"]["position_error_mm"] < 1e-6
+        assert env.info["errors"]["tilt_error_deg"] < 1e-6
         np.testing.assert_allclose(env.task.goal, scenario.target + 0.05 * scenario.normal)
         assert env.physics.data.ncon == 0
         ids = env.renderer.segmentation(env.physics.data.ptr, env.task.cameras["eih"].id, 112, 112)
@@ -129,7 +129,7 @@ def test_the_target_has_the_size_that_was_asked_for(diameter_m: float) -> None:
         env.task.place(env.physics, goal_posture(env))
         camera = env.task.cameras["eih"]
         ids = env.renderer.segmentation(env.physics.data.ptr, camera.id, 112, 112)
-        area = (ids == env.task.marker_geom).sum()
+        area = (ids == env.task.family.marker_geom).sum()
         diameter_px = np.sqrt(4 * area / np.pi)
         assert diameter_px * 0.050 / camera.K[0, 0] == pytest.approx(diameter_m, rel=0.03)
 

@@ -45,7 +45,7 @@ def same(first, second):
     )
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.each_task
 def test_gymnasium_finds_nothing_to_complain_about(task):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -54,7 +54,7 @@ def test_gymnasium_finds_nothing_to_complain_about(task):
         env.close()
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.each_task
 def test_stable_baselines_finds_nothing_to_complain_about(task):
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
     with warnings.catch_warnings():
@@ -218,7 +218,7 @@ def test_options_of_the_task_are_keywords():
 
 @may_fork
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.each_task
 def test_a_scenario_asked_for_by_index_is_the_same_in_any_worker(task):
     """Whatever the worker played before, and bit for bit: pictures, joints and physics."""
     workers = gymnasium.make_vec(

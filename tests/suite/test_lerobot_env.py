@@ -39,7 +39,7 @@ def test_importing_the_package_registers_the_type(package):
     assert (config.type, config.fps, config.split) == ("hvs", 10, "test")
 
 
-@pytest.mark.parametrize("task", sorted(hvs_suite.TASKS))
+@pytest.mark.each_task
 def test_features_follow_from_the_task(package, task):
     from lerobot.envs import env_to_policy_features
 

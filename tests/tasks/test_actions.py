@@ -160,7 +160,7 @@ def test_latency_delays_an_action_by_whole_steps(latency: int) -> None:
         assert len(late.pending_setpoints) == latency
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_only_drill_answers_late(named: Named, task: str) -> None:
     env = named(task, "state")
     env.reset(scenario=0)

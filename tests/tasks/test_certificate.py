@@ -22,7 +22,7 @@ from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS
 QUESTIONS = ("reachable", "in time", "observable", "accurate", "solved")
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_a_name_means_what_the_lock_says(task: str) -> None:
     """If this fails, raise the task's version and run ``hvs certify TASK``."""
     assert lock.compute_entry(hvs_suite.TASKS[task]) == lock.lock()[task]
@@ -51,7 +51,7 @@ def test_changing_what_a_name_means_changes_its_digest() -> None:
     assert tolerance.test_scenarios == entry.test_scenarios
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_the_stored_certificate_is_of_this_task_and_every_line_of_it_holds(task: str) -> None:
     stored = certificate.load_certificate(task)
     assert stored.task == task
@@ -63,7 +63,7 @@ def test_the_stored_certificate_is_of_this_task_and_every_line_of_it_holds(task:
         assert any(check.what.startswith(question) for check in stored.checks), question
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_every_tolerance_has_a_line_that_names_the_source_of_the_information(task: str) -> None:
     spec = hvs_suite.TASKS[task]
     lines = [c.what for c in certificate.load_certificate(task).checks]
@@ -85,7 +85,7 @@ def test_certificates_are_of_the_named_tasks_alone() -> None:
 
 
 @pytest.mark.parametrize("n", [15, pytest.param(TEST_SCENARIOS, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_the_certificate_holds_when_it_is_computed_anew(task: str, n: int) -> None:
     with hvs_suite.load(task, split="test") as env:
         checks = certificate.certify(env, range(n))
@@ -96,7 +96,7 @@ def test_the_certificate_holds_when_it_is_computed_anew(task: str, n: int) -> No
 
 
 @pytest.mark.parametrize("n", [4, pytest.param(TEST_SCENARIOS, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_the_expert_solves_the_test_scenarios_without_a_collision(task: str, n: int) -> None:
     with hvs_suite.load(task, split="test", observations="state") as env:
         expert = make_expert(env)
@@ -139,7 +139,7 @@ def test_a_target_too_small_to_see_would_be_noticed() -> None:
     assert not footprint.holds
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_blind_starts_are_counted_and_leave_time_to_look(task: str) -> None:
     """The upright arm hides the target from eye to hand in some scenes, as in a real cell."""
     lines = {check.what: check for check in certificate.load_certificate(task).checks}

@@ -222,7 +222,7 @@ def test_physics_runs_at_240_hz_and_24_substeps_make_a_control_step() -> None:
         assert env.physics.data.time == pytest.approx(24 / 240)
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_training_takes_a_discount_of_its_own(task: str) -> None:
     with hvs_suite.load(task, observations="state", discount=0.99) as env:
         env.reset(scenario=0)
