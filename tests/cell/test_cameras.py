@@ -37,11 +37,11 @@ def magnify() -> Iterator[Callable[[Environment], Renderer]]:
 
 def outline(env: Environment, name: str) -> FloatArray:
     """Where the target's rim is projected, (n, 2) px; its centroid allows for perspective."""
-    camera, scenario = env.task.cameras[name], env.scenario
-    across = np.linalg.svd(scenario.normal[None])[2][1:]
+    camera, goal = env.task.cameras[name], env.goal()
+    across = np.linalg.svd(goal.normal[None])[2][1:]
     turns = np.linspace(0.0, 2.0 * np.pi, 720, endpoint=False)
     rim = np.stack([np.cos(turns), np.sin(turns)], axis=1) @ across
-    centre = scenario.target + scenario.normal * 2.0 * HALF_THICKNESS_M
+    centre = goal.target + goal.normal * 2.0 * HALF_THICKNESS_M
     points = centre + rim * env.spec.target_diameter_m / 2.0
     return cameras.project(points, camera.K, camera.T(env.physics.data.ptr))[:, :2]
 
@@ -99,7 +99,7 @@ def test_the_projected_target_lies_where_eye_in_hand_shows_it(
         env.reset(scenario=index)
         aside, tilt = (0.005, 4.0) if radius < 0.02 else (0.001, 1.0)
         postures = [goal_posture(env), displaced(env, lateral_m=aside, tilt_deg=tilt)]
-        if 0.48 < np.linalg.norm(env.scenario.target) < 0.66:
+        if 0.48 < np.linalg.norm(env.goal().target) < 0.66:
             postures.append(displaced(env, lateral_m=0.03, height_m=0.12, tilt_deg=8.0))
         for posture in postures:
             env.task.place(env.physics, posture)

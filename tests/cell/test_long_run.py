@@ -6,8 +6,6 @@ import sys
 
 import pytest
 
-import hvs_suite
-
 _PROBE = """
 import gc
 import resource

@@ -267,9 +267,13 @@ def test_info_holds_plain_bools_and_numbers(named: Named, task: str) -> None:
     kinds = {
         "task": str, "split": str, "scenario": int, "is_success": bool, "success_once": bool,
         "collision": bool, "truncated": bool, "n_inside": int, "n_clipped": int, "steps": int,
-        **dict.fromkeys(ERRORS, float),
+        "steps_to_goal": type(None), "errors": dict,
     }  # fmt: skip
     assert {name: type(value) for name, value in env.info.items()} == kinds
+    metrics = [metric.name for metric in env.spec.metrics]
+    assert set(ERRORS) <= set(metrics)
+    assert [*env.info["errors"]] == metrics
+    assert {type(value) for value in env.info["errors"].values()} == {float}
 
 
 def test_privileged_values_are_the_truth(named: Named) -> None:
