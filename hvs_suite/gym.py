@@ -40,8 +40,8 @@ class TaskEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
     counted in ``info["n_clipped"]``, because learned policies overshoot.
 
     ``terminated`` means goal or collision, ``truncated`` the time limit. ``info`` holds Python
-    bools, ints, floats and strings: ``is_success``, ``collision``, ``truncated``, ``split``,
-    ``scenario``, ``steps``, the four errors and what else ``Environment.info`` has.
+    bools, ints and strings: ``is_success``, ``collision``, ``truncated``, ``split``, ``scenario``,
+    ``steps`` and what else ``Environment.info`` has; ``errors`` maps the task's metrics to floats.
 
     Args:
         task: Registered name, such as ``align-thesis``.

@@ -1,4 +1,4 @@
-"""What the rooms' tests share: named tasks that are loaded once a process.
+"""What the rooms' tests share: named tasks, which to play and loaded once a process.
 
 Sharing them is safe because a scenario depends on nothing that ran before, which
 ``tests/cell/test_environment.py`` proves with environments of its own.
@@ -13,6 +13,33 @@ import hvs_suite
 
 if TYPE_CHECKING:
     from hvs_suite.tasks.shared.environment import Environment
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line(
+        "markers",
+        "each_task(*also, family=None): play every named task (of a family) as the argument task; "
+        "make test plays the first of each family and those that are named, the rest are slow",
+    )
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Parametrise what is marked ``each_task``."""
+    marker = metafunc.definition.get_closest_marker("each_task")
+    if marker is None:
+        return
+    asked = marker.kwargs.get("family")
+    families = {name: spec.family for name, spec in hvs_suite.TASKS.items()}
+    firsts = {family: name for name, family in reversed(families.items())}
+    quick = {*firsts.values(), *marker.args}
+    metafunc.parametrize(
+        "task",
+        [
+            pytest.param(name, marks=() if name in quick else pytest.mark.slow)
+            for name, family in families.items()
+            if asked in (None, family)
+        ],
+    )
 
 
 @pytest.fixture(scope="session")

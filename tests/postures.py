@@ -27,19 +27,19 @@ def way(start: FloatArray, goal: FloatArray, n: int = 40) -> FloatArray:
 
 def goal_posture(env: "Environment") -> FloatArray:
     """The goal posture that the arm gets to soonest from its start without touching anything."""
-    scenario = env.scenario
-    goal = scenario.target + scenario.normal * env.spec.standoff_m
-    start = scenario.start
-    family = kinematics().goal_configurations_at_tool_angle(goal, scenario.normal, float(start[6]))
+    goal, start = env.goal(), env.scenario.start
+    family = kinematics().goal_configurations_at_tool_angle(
+        goal.position, goal.normal, float(start[6])
+    )
     for q in family[np.argsort(travel_time(start, family, acceleration_limits=False))]:
         if _is_clear(env, way(start, q)):
             return np.asarray(q)
-    raise AssertionError(f"no clear way in scenario {scenario.index}")
+    raise AssertionError(f"no clear way in scenario {env.scenario.index}")
 
 
 def _is_clear(env: "Environment", steps: FloatArray) -> bool:
     # The clearance query knows level surfaces only; on others MuJoCo's contacts have to do.
-    level = env.spec.surface == "flat"
+    level = env.task.root_entity.surface.shape == "flat"
     floor = 0.0 if level else -1.0
     if any(kinematics().clearance(q, floor) < _CLEARANCE_M for q in steps):
         return False
@@ -77,20 +77,20 @@ def displaced(
         tilt_deg: Angle between the flange axis and the inward normal (deg).
         yaw: Turn about the flange axis (rad).
     """
-    scenario, spec = env.scenario, env.spec
-    frame = tool_frame(scenario.normal)
-    goal = scenario.target + scenario.normal * (spec.standoff_m + height_m)
+    goal = env.goal()
+    frame = tool_frame(goal.normal)
+    raised = goal.position + goal.normal * height_m
     angle = np.deg2rad(tilt_deg)
     swivel = np.linspace(-np.pi, np.pi, 24)
     # At the rim of the working area only some directions stay within reach.
     for azimuth in 0.7 + np.arange(4) * np.pi / 2.0:
         across = np.cos(azimuth) * frame[:, 0] + np.sin(azimuth) * frame[:, 1]
         # Lean the tool axis about the other direction of the plane: it stays a unit vector.
-        aside = np.cross(scenario.normal, across)
-        normal = np.cos(angle) * scenario.normal + np.sin(angle) * aside
+        aside = np.cross(goal.normal, across)
+        normal = np.cos(angle) * goal.normal + np.sin(angle) * aside
         family = kinematics().inverse_kinematics(
-            goal + lateral_m * across, normal, np.full(len(swivel), yaw), swivel
+            raised + lateral_m * across, normal, np.full(len(swivel), yaw), swivel
         )
         if len(family):
             return np.asarray(family[0])
-    raise AssertionError(f"scenario {scenario.index}: the displaced pose is out of reach")
+    raise AssertionError(f"scenario {env.scenario.index}: the displaced pose is out of reach")

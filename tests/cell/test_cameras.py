@@ -37,11 +37,11 @@ def magnify() -> Iterator[Callable[[Environment], Renderer]]:
 
 def outline(env: Environment, name: str) -> FloatArray:
     """Where the target's rim is projected, (n, 2) px; its centroid allows for perspective."""
-    camera, scenario = env.task.cameras[name], env.scenario
-    across = np.linalg.svd(scenario.normal[None])[2][1:]
+    camera, goal = env.task.cameras[name], env.goal()
+    across = np.linalg.svd(goal.normal[None])[2][1:]
     turns = np.linspace(0.0, 2.0 * np.pi, 720, endpoint=False)
     rim = np.stack([np.cos(turns), np.sin(turns)], axis=1) @ across
-    centre = scenario.target + scenario.normal * 2.0 * HALF_THICKNESS_M
+    centre = goal.target + goal.normal * 2.0 * HALF_THICKNESS_M
     points = centre + rim * env.spec.target_diameter_m / 2.0
     return cameras.project(points, camera.K, camera.T(env.physics.data.ptr))[:, :2]
 
@@ -64,7 +64,7 @@ def miss(env: Environment, name: str, renderer: Renderer) -> float | None:
     scale = _DRAWN_PX // camera.resolution
     side = scale * camera.resolution
     ids = renderer.segmentation(env.physics.data.ptr, camera.id, side, side)
-    rows, columns = np.nonzero(ids == env.task.marker_geom)
+    rows, columns = np.nonzero(ids == env.task.family.marker_geom)
     # The drawn disc has 20 corners, so it lacks 1.6 % of its area; more is the arm before it.
     if len(rows) < 0.93 * area * scale**2:
         return None
@@ -73,7 +73,7 @@ def miss(env: Environment, name: str, renderer: Renderer) -> float | None:
 
 
 @pytest.mark.parametrize("n", [5, pytest.param(100, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_the_projected_target_lies_where_eye_to_hand_shows_it(
     named: Named, magnify: Callable[[Environment], Renderer], task: str, n: int
 ) -> None:
@@ -88,7 +88,7 @@ def test_the_projected_target_lies_where_eye_to_hand_shows_it(
 
 
 @pytest.mark.parametrize("n", [5, pytest.param(100, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_the_projected_target_lies_where_eye_in_hand_shows_it(
     named: Named, magnify: Callable[[Environment], Renderer], task: str, n: int
 ) -> None:
@@ -99,7 +99,7 @@ def test_the_projected_target_lies_where_eye_in_hand_shows_it(
         env.reset(scenario=index)
         aside, tilt = (0.005, 4.0) if radius < 0.02 else (0.001, 1.0)
         postures = [goal_posture(env), displaced(env, lateral_m=aside, tilt_deg=tilt)]
-        if 0.48 < np.linalg.norm(env.scenario.target) < 0.66:
+        if 0.48 < np.linalg.norm(env.goal().target) < 0.66:
             postures.append(displaced(env, lateral_m=0.03, height_m=0.12, tilt_deg=8.0))
         for posture in postures:
             env.task.place(env.physics, posture)
@@ -108,7 +108,7 @@ def test_the_projected_target_lies_where_eye_in_hand_shows_it(
     assert max(value for value in found if value is not None) <= MAX_MISS_PX
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_the_task_s_own_picture_shows_the_target_where_it_is_projected(
     named: Named, task: str
 ) -> None:
@@ -120,7 +120,7 @@ def test_the_task_s_own_picture_shows_the_target_where_it_is_projected(
         camera = env.task.cameras["eih"]
         side = camera.resolution
         ids = env.renderer.segmentation(env.physics.data.ptr, camera.id, side, side)
-        rows, columns = np.nonzero(ids == env.task.marker_geom)
+        rows, columns = np.nonzero(ids == env.task.family.marker_geom)
         _, centroid = area_and_centroid(outline(env, "eih"))
         drawn = np.array([columns.mean(), rows.mean()])
         assert np.linalg.norm(drawn - centroid) <= MAX_MISS_PX
@@ -129,7 +129,7 @@ def test_the_task_s_own_picture_shows_the_target_where_it_is_projected(
         assert np.linalg.norm(found.centre - centroid) <= 0.3
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_the_whole_target_is_in_view_at_the_goal_with_margin(named: Named, task: str) -> None:
     env = named(task)
     for index in range(3):
@@ -140,7 +140,7 @@ def test_the_whole_target_is_in_view_at_the_goal_with_margin(named: Named, task:
         assert polygon.max() < 0.95 * side
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_eye_to_hand_sees_the_whole_ring(named: Named, task: str) -> None:
     """Even where the variant turns the camera by the most that it may."""
     env = named(task)
@@ -276,10 +276,10 @@ def test_what_is_said_to_be_visible_is_drawn_and_what_is_hidden_is_not(
     for index in range(60):
         env.reset(scenario=index)
         camera = env.task.cameras["eth"]
-        u, v, diameter, seen = env.task.target_in_image(env.physics, "eth")
+        u, v, diameter, seen = env.privileged()["target_eth"]
         side = camera.resolution
         ids = env.renderer.segmentation(env.physics.data.ptr, camera.id, side, side)
-        drawn = ids == env.task.marker_geom
+        drawn = ids == env.task.family.marker_geom
         if seen:
             visible += 1
             assert max(abs(u), abs(v)) <= 1.0

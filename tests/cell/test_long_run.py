@@ -6,8 +6,6 @@ import sys
 
 import pytest
 
-import hvs_suite
-
 _PROBE = """
 import gc
 import resource
@@ -58,6 +56,6 @@ def test_a_thousand_resets_leave_memory_flat_and_the_exit_is_silent(end: str) ->
 
 @pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_ten_thousand_resets_leave_memory_flat_and_the_exit_is_silent(task: str) -> None:
     assert play(task, 10_000, "leave") <= MAX_GROWTH_MIB

@@ -39,7 +39,7 @@ def test_importing_the_package_registers_the_type(package):
     assert (config.type, config.fps, config.split) == ("hvs", 10, "test")
 
 
-@pytest.mark.parametrize("task", sorted(hvs_suite.TASKS))
+@pytest.mark.each_task
 def test_features_follow_from_the_task(package, task):
     from lerobot.envs import env_to_policy_features
 
@@ -75,7 +75,7 @@ def test_seeds_from_1000_up_are_the_first_test_scenarios(vector):
 def test_attributes_that_lerobot_asks_for_are_there(vector):
     assert vector.call("_max_episode_steps") == (20, 20)
     assert vector.call("task") == ("align-easy", "align-easy")
-    assert vector.call("task_description")[0] == hvs_suite.TASKS["align-easy"].instruction
+    assert vector.call("task_description")[0] == hvs_suite.TASKS["align-easy"].instruction()
     assert vector.metadata["render_fps"] == 10
     vector.reset(seed=0)
     assert vector.envs[0].render().shape == (480, 480, 3)

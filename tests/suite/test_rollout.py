@@ -58,10 +58,8 @@ class Counter:
             "success_once": success,
             "collision": False,
             "truncated": self.steps == LIMIT and not success,
-            "position_error_mm": float(self.scenario),
-            "lateral_error_mm": 1.0,
-            "height_error_mm": 2.0,
-            "tilt_error_deg": 3.0,
+            "steps_to_goal": self.steps if success else None,
+            "errors": {"position_error_mm": float(self.scenario), "tilt_error_deg": 3.0},
             "process": os.getpid(),
             "threads": os.environ.get("LP_NUM_THREADS"),
         }

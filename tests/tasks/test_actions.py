@@ -160,14 +160,15 @@ def test_latency_delays_an_action_by_whole_steps(latency: int) -> None:
         assert len(late.pending_setpoints) == latency
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
-def test_only_drill_answers_late(named: Named, task: str) -> None:
+@pytest.mark.each_task("align-drill", "sequence-hard", "track-hard")
+def test_tasks_answer_as_late_as_they_say(named: Named, task: str) -> None:
     env = named(task, "state")
     env.reset(scenario=0)
     env.step(env.commandable(env.scenario.start + 0.05))
     moved = np.abs(env.joint_positions - env.scenario.start).max() > 1e-3
-    assert moved == (task != "align-drill")
-    assert env.spec.latency_steps == (1 if task == "align-drill" else 0)
+    is_late = task in ("align-drill", "sequence-hard", "track-hard")
+    assert moved == (not is_late)
+    assert env.spec.latency_steps == int(is_late)
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -50,7 +50,7 @@ def test_textures_are_keyed_pictures_with_some_contrast() -> None:
     assert one.std() > 5
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_the_target_can_be_found_by_its_colour_under_the_task_s_own_disturbances(
     named: Named, task: str
 ) -> None:
@@ -58,7 +58,7 @@ def test_the_target_can_be_found_by_its_colour_under_the_task_s_own_disturbances
     misses = []
     for index in range(25):
         seen = env.reset(scenario=index).observation
-        u, v, _, visible = env.task.target_in_image(env.physics, "eth")
+        u, v, _, visible = env.privileged()["target_eth"]
         if visible:
             found = find_disc(seen["eth"])
             true = (np.array([u, v]) + 1) / 2 * env.spec.eth_resolution - 0.5
@@ -71,7 +71,7 @@ def test_the_target_can_be_found_by_its_colour_under_the_task_s_own_disturbances
 def test_nothing_else_in_the_cell_is_as_red_as_the_target(named: Named, task: str) -> None:
     """Where the target is taken away, nothing is found: not the orange of the robot either."""
     env = named(task)
-    groups, target = env.physics.model.geom_group, env.task.marker_geom
+    groups, target = env.physics.model.geom_group, env.task.family.marker_geom
     for index in range(10):
         env.reset(scenario=index)
         shown, groups[target] = groups[target], NEVER_DRAWN

@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,18 +15,28 @@ from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.cli.main import run
 from hvs_suite.datasets.expert import make_expert
 from hvs_suite.errors import LockError
+from hvs_suite.registry import make_task
 from hvs_suite.rollout import run_episode
 from hvs_suite.tasks.shared import certificate, lock
+from hvs_suite.tasks.shared.environment import Environment
 from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS
+
+
+def entry_of(task: str, **changes: Any) -> lock.LockEntry:
+    """What a task would mean, were these fields of it others."""
+    spec = dataclasses.replace(hvs_suite.TASKS[task], **changes)
+    with Environment(make_task(spec, "test")) as env:
+        return lock.compute_entry(env)
+
 
 # The lines that answer one of the four questions; each must stand in every certificate.
 QUESTIONS = ("reachable", "in time", "observable", "accurate", "solved")
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_a_name_means_what_the_lock_says(task: str) -> None:
     """If this fails, raise the task's version and run ``hvs certify TASK``."""
-    assert lock.compute_entry(hvs_suite.TASKS[task]) == lock.lock()[task]
+    assert entry_of(task) == lock.lock()[task]
 
 
 def test_the_lock_holds_exactly_the_named_tasks() -> None:
@@ -36,22 +47,21 @@ def test_the_lock_holds_exactly_the_named_tasks() -> None:
 
 
 def test_changing_what_a_name_means_changes_its_digest() -> None:
-    spec = hvs_suite.TASKS["align-easy"]
-    entry = lock.compute_entry(spec)
-    for change in (
+    entry = entry_of("align-easy")
+    changes: list[dict[str, Any]] = [
         {"version": 2},
         {"tilt_tolerance_deg": 4.9},
         {"eth_fov_deg": 31.5},
         {"observations": "eih"},
-    ):
-        changed = lock.compute_entry(dataclasses.replace(spec, **change))  # type: ignore[arg-type]
-        assert changed.digest != entry.digest, change
+    ]
+    for change in changes:
+        assert entry_of("align-easy", **change).digest != entry.digest, change
     # What shapes no scene leaves the scenarios, and their digest, as they are.
-    tolerance = lock.compute_entry(dataclasses.replace(spec, tilt_tolerance_deg=4.9))
+    tolerance = entry_of("align-easy", tilt_tolerance_deg=4.9)
     assert tolerance.test_scenarios == entry.test_scenarios
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_the_stored_certificate_is_of_this_task_and_every_line_of_it_holds(task: str) -> None:
     stored = certificate.load_certificate(task)
     assert stored.task == task
@@ -63,7 +73,7 @@ def test_the_stored_certificate_is_of_this_task_and_every_line_of_it_holds(task:
         assert any(check.what.startswith(question) for check in stored.checks), question
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_every_tolerance_has_a_line_that_names_the_source_of_the_information(task: str) -> None:
     spec = hvs_suite.TASKS[task]
     lines = [c.what for c in certificate.load_certificate(task).checks]
@@ -85,7 +95,7 @@ def test_certificates_are_of_the_named_tasks_alone() -> None:
 
 
 @pytest.mark.parametrize("n", [15, pytest.param(TEST_SCENARIOS, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_the_certificate_holds_when_it_is_computed_anew(task: str, n: int) -> None:
     with hvs_suite.load(task, split="test") as env:
         checks = certificate.certify(env, range(n))
@@ -96,7 +106,7 @@ def test_the_certificate_holds_when_it_is_computed_anew(task: str, n: int) -> No
 
 
 @pytest.mark.parametrize("n", [4, pytest.param(TEST_SCENARIOS, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_the_expert_solves_the_test_scenarios_without_a_collision(task: str, n: int) -> None:
     with hvs_suite.load(task, split="test", observations="state") as env:
         expert = make_expert(env)
@@ -139,7 +149,7 @@ def test_a_target_too_small_to_see_would_be_noticed() -> None:
     assert not footprint.holds
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_blind_starts_are_counted_and_leave_time_to_look(task: str) -> None:
     """The upright arm hides the target from eye to hand in some scenes, as in a real cell."""
     lines = {check.what: check for check in certificate.load_certificate(task).checks}
@@ -163,7 +173,7 @@ def own_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[lock.L
     monkeypatch.setattr(lock, "FILE", Path(shutil.copy(lock.FILE, tmp_path)))
     monkeypatch.setattr("hvs_suite.tasks.shared.scenario.TEST_SCENARIOS", 4)
     lock.lock.cache_clear()
-    yield lock.compute_entry(hvs_suite.TASKS["align-easy"])
+    yield entry_of("align-easy")
     lock.lock.cache_clear()
 
 

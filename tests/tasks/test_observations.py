@@ -36,7 +36,7 @@ def test_every_input_combination_of_the_thesis_is_there(observations: str) -> No
             spec.validate(time_step.observation[name])
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_vision_holds_nothing_privileged_and_state_no_pictures(named: Named, task: str) -> None:
     assert list(named(task).observation_spec()) == [
         "eih", "eth", "joint_positions", "joint_velocities",
@@ -47,7 +47,7 @@ def test_vision_holds_nothing_privileged_and_state_no_pictures(named: Named, tas
     assert not set(named(task).observation_spec()) & PRIVILEGED
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_pictures_have_the_size_of_the_variant(named: Named, task: str) -> None:
     env = named(task)
     seen = env.reset(scenario=0).observation
@@ -191,5 +191,5 @@ def test_the_state_preset_tells_where_flange_and_goal_are(named: Named) -> None:
     np.testing.assert_allclose(seen["goal_position"], env.privileged()["goal_position"])
     np.testing.assert_allclose(
         np.linalg.norm(seen["goal_position"] - seen["flange_position"]) * 1000,
-        env.info["position_error_mm"],
+        env.info["errors"]["position_error_mm"],
     )

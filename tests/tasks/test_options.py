@@ -188,10 +188,12 @@ def test_named_tasks_mean_what_the_table_of_tasks_says() -> None:
     tasks = hvs_suite.TASKS
     assert list(tasks) == [
         "align-fixed", "align-easy", "align-thesis", "align-hard", "align-drill", "align-limit",
+        "sequence-thesis", "sequence-hard", "track-line", "track-curve", "track-hard",
     ]  # fmt: skip
+    own = {"align": "goal", "sequence": "target_steps", "track": "motion"}
     rows = {
         name: (
-            v.start, v.goal, v.target_diameter_m, v.position_tolerance_mm, v.lateral_tolerance_mm,
+            v.start, getattr(v, own[v.family]), v.target_diameter_m, v.position_tolerance_mm, v.lateral_tolerance_mm,
             v.height_tolerance_mm, v.tilt_tolerance_deg, v.hold_steps, v.time_limit_steps,
         )
         for name, v in tasks.items()
@@ -203,13 +205,18 @@ def test_named_tasks_mean_what_the_table_of_tasks_says() -> None:
         "align-hard": ("random", "random", 0.02, 0.5, None, None, 0.5, 3, 40),
         "align-drill": ("random", "random", 0.01, None, 0.25, 1.0, 0.4, 5, 40),
         "align-limit": ("random", "random", 0.02, None, 0.1, 0.3, 0.2, 5, 40),
+        "sequence-thesis": ("zero", 25, 0.05, 1.0, None, None, 1.0, 1, 125),
+        "sequence-hard": ("random", 40, 0.02, 0.5, None, None, 0.5, 3, 200),
+        "track-line": ("zero", "line", 0.05, 1.0, None, None, 1.0, 20, 60),
+        "track-curve": ("zero", "curve", 0.05, 1.0, None, None, 1.0, 20, 60),
+        "track-hard": ("random", "curve", 0.02, 1.0, None, None, 0.5, 20, 80),
     }
     for v in tasks.values():
         assert v.standoff_m == 0.05
         assert v.control_period_s == 0.1
         assert v.ring_m == (0.40, 0.78)
         assert v.action_mode == "joint_position"
-        assert v.surface_size_m == (2.0, 2.0)
+        assert getattr(v, "surface_size_m", (2.0, 2.0)) == (2.0, 2.0)
         assert 60 <= v.eih_fov_deg <= 75
 
 
@@ -222,7 +229,7 @@ def test_physics_runs_at_240_hz_and_24_substeps_make_a_control_step() -> None:
         assert env.physics.data.time == pytest.approx(24 / 240)
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_training_takes_a_discount_of_its_own(task: str) -> None:
     with hvs_suite.load(task, observations="state", discount=0.99) as env:
         env.reset(scenario=0)

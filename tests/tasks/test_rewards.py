@@ -148,8 +148,8 @@ def test_the_environment_pays_what_the_formulas_say(task: str) -> None:
         time_step = env.step(goal)
         paid = []
         while not time_step.last():
-            info, d = env.info, env.info["position_error_mm"] / 1000
-            a = info["tilt_error_deg"]
+            info, d = env.info, env.info["errors"]["position_error_mm"] / 1000
+            a = info["errors"]["tilt_error_deg"]
             expected = {
                 "time": -0.05,
                 "position": 0.4 if 1000 * d <= tolerance else 0.4 * (length - d) / length,

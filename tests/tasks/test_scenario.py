@@ -14,23 +14,24 @@ from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.cell.robot import JOINT_RANGE_RAD
 from hvs_suite.cell.surface import Surface
 from hvs_suite.errors import OptionError, ScenarioError
+from hvs_suite.registry import make_task
+from hvs_suite.tasks.align import fixed_places
 from hvs_suite.tasks.shared.environment import Environment
-from hvs_suite.tasks.shared.scenario import ScenarioSource, fixed_places, steps_lower_bound
+from hvs_suite.tasks.shared.scenario import ScenarioSource
+from hvs_suite.tasks.shared.start import steps_lower_bound
 
 Named = Callable[..., Environment]
-RANDOM_STARTS = [name for name, spec in hvs_suite.TASKS.items() if spec.start == "random"]
 
 
 def source(task: str, split: str = "test", **options: Any) -> ScenarioSource:
-    spec = with_options(hvs_suite.TASKS[task], options)
-    return ScenarioSource(spec, split, Surface(shape=spec.surface))
+    return make_task(hvs_suite.TASKS[task].with_options(options), split).source
 
 
 def digests(draws: ScenarioSource, indices: list[int]) -> list[str]:
     return [draws.draw(index).digest() for index in indices]
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_a_scenario_depends_on_its_index_and_on_no_other_draw(task: str) -> None:
     forward, backward = source(task), source(task)
     indices = [0, 1, 2, 37, 999]
@@ -42,7 +43,7 @@ def test_a_scenario_depends_on_its_index_and_on_no_other_draw(task: str) -> None
     assert digests(forward, [37]) == [expected[3]]
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_options_that_do_not_shape_the_scene_leave_it_alone(task: str) -> None:
     expected = digests(source(task), [0, 5])
     for options in (
@@ -86,7 +87,7 @@ def test_tasks_versions_and_splits_have_streams_of_their_own() -> None:
         for split in ("train", "test", "held-out")
     }
     spec = dataclasses.replace(hvs_suite.TASKS["align-easy"], version=2)
-    targets["next version"] = tuple(ScenarioSource(spec, "test", Surface()).draw(0).target)
+    targets["next version"] = tuple(make_task(spec, "test").source.draw(0).target)
     assert len(set(targets.values())) == len(targets)
 
 
@@ -118,7 +119,7 @@ def test_a_split_needs_a_name(split: Any) -> None:
         hvs_suite.load("align-easy", split=split)
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_info_carries_task_split_and_scenario(named: Named, task: str) -> None:
     env = named(task, "state")
     env.reset(scenario=12)
@@ -145,7 +146,7 @@ def test_a_seed_plays_the_scenario_of_that_number() -> None:
         assert env.info["scenario"] == 2**40 + 3
 
 
-@pytest.mark.parametrize("task", hvs_suite.TASKS)
+@pytest.mark.each_task
 def test_workers_seeded_in_a_row_share_no_scenes(task: str) -> None:
     train, test = source(task, "train"), source(task, "test")
     # Sixteen workers, a thousand resets each.
@@ -182,8 +183,9 @@ def test_no_global_generator_is_drawn_from(monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.parametrize("task", ["align-easy", "align-thesis", "align-hard"])
 def test_targets_are_uniform_in_area_on_the_ring(task: str) -> None:
-    draws = source(task)
-    targets = np.array([draws._target(index)[0] for index in range(1000)])
+    played = make_task(hvs_suite.TASKS[task], "test")
+    streams = map(played.source.streams, range(1000))
+    targets = np.array([played.family._draw_goal(each).target for each in streams])
     radius = np.hypot(targets[:, 0], targets[:, 1])
     assert radius.min() >= 0.40
     assert radius.max() <= 0.78
@@ -217,22 +219,22 @@ def test_fixed_places_are_ten_and_taken_by_index() -> None:
 
 
 @pytest.mark.parametrize("n", [100, pytest.param(1000, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("task", RANDOM_STARTS)
+@pytest.mark.parametrize(
+    "task", ["align-hard", "align-drill", "align-limit", "sequence-hard", "track-hard"]
+)
 def test_random_starts_are_clear_and_far_from_the_goal_with_time_to_spare(
-    task: str, n: int
+    named: Named, task: str, n: int
 ) -> None:
-    spec, draws, model = hvs_suite.TASKS[task], source(task), kinematics()
+    env, model = named(task, "state"), kinematics()
     starts = []
     for index in range(n):
-        scenario = draws.draw(index)
-        q = scenario.start
+        env.reset(scenario=index)
+        q, goal = env.scenario.start, env.goal()
         starts.append(q)
-        goal = scenario.target + spec.standoff_m * scenario.normal
         assert (np.abs(q) <= 0.8 * JOINT_RANGE_RAD).all()
         assert model.clearance(q) >= 0.05
-        assert np.linalg.norm(model.flange_pose(q)[1] - goal) >= 0.10
-        steps = steps_lower_bound(spec, q, goal, scenario.normal)
-        assert steps + 5 <= spec.time_limit_steps
+        assert np.linalg.norm(model.flange_pose(q)[1] - goal.position) >= 0.10
+        assert steps_lower_bound(env.spec, q, goal) + 5 <= env.spec.time_limit_steps
     spread = np.ptp(np.array(starts) / JOINT_RANGE_RAD, axis=0)
     assert (spread > 1.2).all()
 
@@ -244,7 +246,7 @@ def test_starts_of_the_thesis_are_upright() -> None:
 
 def test_joint_offsets_are_normal_and_cut_at_two_sigma() -> None:
     draws = source("align-drill")
-    offsets = np.array([draws._cut_normal("joint_offset", i, 7) for i in range(400)]) * 0.05
+    offsets = np.array([draws.streams(i).cut_normal("joint_offset", 7) for i in range(400)]) * 0.05
     np.testing.assert_allclose(np.deg2rad(offsets[6]), draws.draw(6).joint_offset)
     assert 0.095 < np.abs(offsets).max() <= 0.100
     # A unit normal cut at two sigma has a standard deviation of 0.880.
@@ -252,7 +254,11 @@ def test_joint_offsets_are_normal_and_cut_at_two_sigma() -> None:
     assert abs(offsets.mean()) < 0.003
 
 
-@pytest.mark.parametrize("task", ["align-fixed", "align-easy", "align-thesis", "align-limit"])
+@pytest.mark.parametrize(
+    "task",
+    ["align-fixed", "align-easy", "align-thesis", "align-limit", "sequence-thesis", "track-line",
+     "track-curve"],
+)  # fmt: skip
 def test_undisturbed_tasks_are_undisturbed(task: str) -> None:
     scenario = source(task).draw(4)
     for value in (scenario.joint_offset, scenario.eth_shift, scenario.eth_turn):
@@ -264,7 +270,7 @@ def test_undisturbed_tasks_are_undisturbed(task: str) -> None:
     np.testing.assert_array_equal(scenario.light_level, 1.0)
 
 
-@pytest.mark.parametrize("task", ["align-hard", "align-drill"])
+@pytest.mark.parametrize("task", ["align-hard", "align-drill", "sequence-hard", "track-hard"])
 def test_disturbed_tasks_draw_every_disturbance_anew(task: str) -> None:
     draws = source(task)
     scenes = [draws.draw(index) for index in range(8)]
