@@ -54,18 +54,24 @@ def near_a_bound(folder: Path) -> Path:
     with hvs_suite.load("align-fixed", split="test", observations="state") as env:
         for scenario in range(10):
             log[scenario] = np.zeros_like(log[scenario]) if scenario > 1 else log[scenario]
-            course = brought_to_the_bound(env, scenario, log) if scenario < 2 else None
-            rows[scenario] = play(env, scenario, log[scenario])
-            if course is not None:
-                rows[scenario] = claimed(rows[scenario], course)
+            step = brought_to_the_bound(env, scenario, log) if scenario < 2 else None
+            rows[scenario], _ = play(env, scenario, log[scenario])
+            if step is not None:
+                rows[scenario] = claimed(rows[scenario], step)
     with_log(path, log, lambda row: rows[row.scenario])
     return path
 
 
-def play(env: Any, scenario: int, actions: Any) -> EpisodeRow:
-    remaining = iter(actions)
-    row, _ = trial.play_trial(env, lambda: None, lambda _: next(remaining), scenario)
-    return row
+def play(env: Any, scenario: int, actions: Any) -> tuple[EpisodeRow, list[dict[str, float]]]:
+    """The row that actions give, and the errors at the start and after each of them."""
+    remaining, errors = iter(actions), []
+
+    def decide(_: Any) -> Any:
+        errors.append(env.info["errors"])
+        return next(remaining)
+
+    row, _ = trial.play_trial(env, lambda: None, decide, scenario)
+    return row, [*errors, env.info["errors"]]
 
 
 def brought_to_the_bound(env: Any, scenario: int, log: list[Any]) -> int:
@@ -75,12 +81,7 @@ def brought_to_the_bound(env: Any, scenario: int, log: list[Any]) -> int:
     log[scenario][:, 0] *= -1
 
     def tilts() -> list[float]:
-        time_step, found = env.reset(scenario=scenario), []
-        for action in log[scenario]:
-            found.append(env.info["errors"]["tilt_error_deg"])
-            if not time_step.last():
-                time_step = env.step(np.clip(action, -1.0, 1.0))
-        return [*found, env.info["errors"]["tilt_error_deg"]]
+        return [errors["tilt_error_deg"] for errors in play(env, scenario, log[scenario])[1]]
 
     step = next(k for k, (a, b) in enumerate(itertools.pairwise(tilts())) if a > bound >= b)
     log[scenario][step + 1 :] = 0.0
@@ -107,15 +108,14 @@ def flattered(folder: Path, forged: Collection[int]) -> Path:
     path.parent.mkdir(parents=True)
     for name in ("align-easy.json", "align-easy.actions.npz"):
         shutil.copy(RESULTS / "zero" / name, path.with_name(name))
-    rewrite(path, lambda r: flatter(r) if r.scenario in forged else r)
+    rewrite(path, lambda r: with_errors(r, 1.0) if r.scenario in forged else r)
     return path
 
 
-def flatter(row: EpisodeRow) -> EpisodeRow:
-    """The same row with errors that are made up."""
-    errors = dict.fromkeys(row.errors, 1.0)
-    settled = row.settled.model_copy(update={"errors": errors})
-    return row.model_copy(update={"errors": errors, "settled": settled})
+def with_errors(row: EpisodeRow, error: float) -> EpisodeRow:
+    """A row whose metrics are all the same, where it was scored and where it settled."""
+    errors = {"errors": dict.fromkeys(row.errors, error)}
+    return row.model_copy(update=errors | {"settled": row.settled.model_copy(update=errors)})
 
 
 def ground_sample(folder: Path) -> Path:

@@ -38,7 +38,7 @@ def test_a_failure_has_its_cause(policy, cause, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("estimate_mm", "distances_m", "cause"),
+    ("estimate_mm", "distances_mm", "cause"),
     [
         (7.0, [0.9, 0.03, 0.008, 0.007, 0.007], Cause.MISPLACED),
         (0.5, [0.9, 0.09, 0.06, 0.03, 0.009], Cause.SLOW),
@@ -46,9 +46,9 @@ def test_a_failure_has_its_cause(policy, cause, tmp_path):
         (None, [0.9, 0.09], Cause.SLOW),
     ],
 )
-def test_an_estimate_and_the_last_steps_tell_eye_from_hand(estimate_mm, distances_m, cause):
-    lost = row(0, success=False, error=1e3 * distances_m[-1])
-    assert cause_of(lost, hvs_suite.TASKS[TASK], 3, estimate_mm, distances_m) is cause
+def test_an_estimate_and_the_last_steps_tell_eye_from_hand(estimate_mm, distances_mm, cause):
+    lost = row(0, success=False, error=distances_mm[-1])
+    assert cause_of(lost, hvs_suite.TASKS[TASK], 3, estimate_mm, errors_mm) is cause
 
 
 def test_what_was_solved_is_no_failure(tmp_path):

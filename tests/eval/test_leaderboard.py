@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from forgeries import flatter
+from forgeries import with_errors
 from test_result_file import make_result, row
 
 from hvs_suite.errors import OptionError, OutputError, ResultError
@@ -207,14 +207,12 @@ def test_the_interval_is_drawn_to_scale() -> None:
 
 def test_a_page_of_six_tasks_and_eight_policies_stays_small() -> None:
     rows = [
-        row(k % 8, success=k % 2 == 0, error=1.0 + k % 7).model_copy(
-            update={
-                "scenario": k,
-                "settled": row(k, success=True, error=1.0).settled.model_copy(
-                    update={"x_mm": k * 0.01, "y_mm": -k * 0.017}
-                ),
-            }
-        )
+        row(
+            k % 8,
+            success=k % 2 == 0,
+            error=1.0 + k % 7,
+            settled={"x_mm": k * 0.01, "y_mm": -k * 0.017},
+        ).model_copy(update={"scenario": k})
         for k in range(1000)
     ]
     # Clips add 12 kB each, 1.6 MB for two of every entry.
@@ -240,9 +238,9 @@ def test_the_curve_of_tolerance_is_the_rows_own() -> None:
 
 def test_landings_stand_where_the_flange_stood() -> None:
     rows = [
-        row(0, success=True, error=1.0, settled_x_mm=5.0, settled_y_mm=2.5),
-        row(2, success=False, error=9.0, settled_x_mm=-90.0, settled_y_mm=0.0),
-        row(3, success=False, error=9.0, settled_x_mm=0.0, settled_y_mm=-10.0),
+        row(0, success=True, error=1.0, settled={"x_mm": 5.0, "y_mm": 2.5}),
+        row(2, success=False, error=9.0, settled={"x_mm": -90.0, "y_mm": 0.0}),
+        row(3, success=False, error=9.0, settled={"x_mm": 0.0, "y_mm": -10.0}),
     ]
     plot = board_plots.landing_plot(rows, 10.0, 5.0, "landings")
     assert '<path class="hit" d="M150 75h0"/>' in plot
@@ -253,7 +251,7 @@ def test_landings_stand_where_the_flange_stood() -> None:
 
 @pytest.mark.parametrize(("error", "radius"), [(0.0, 0.001), (0.9, 1), (1.1, 2), (430.0, 500)])
 def test_the_landing_picture_has_a_round_size(error: float, radius: float) -> None:
-    rows = [row(k, success=False, error=error, settled_x_mm=error) for k in range(5)]
+    rows = [row(k, success=False, error=error, settled={"x_mm": error}) for k in range(5)]
     assert board_plots.landing_radius(rows) == pytest.approx(radius)
 
 
@@ -266,7 +264,7 @@ def test_the_comparison_is_paired_and_corrected() -> None:
                 error=1.0,
                 steps=9,
                 steps_to_goal=9 if k < wins else None,
-                settled_steps=9,
+                settled={"steps": 9},
                 n_clipped=0,
             )
             for k in range(20)
@@ -433,7 +431,7 @@ def flattered_row(results: Path) -> str:
     """A row, summary and seal that agree with each other, and not with the actions."""
     path = results / "zero" / "align-fixed.json"
     result = result_file.load(path)
-    rows = [flatter(r) for r in result.episodes]
+    rows = [with_errors(r, 1.0) for r in result.episodes]
     summary = result_file.Summary.of(
         "align-fixed",
         "zero",
@@ -620,4 +618,4 @@ def test_the_committed_board_is_what_the_committed_results_give(
 
 def played_well(path: Path) -> verification.Verdict:
     n = result_file.load(path).summary.n_episodes
-    return verification.Verdict(n, min(n, board_replays.SAMPLE), 0, None, 0.0, 0.0)
+    return verification.Verdict(n, min(n, board_replays.SAMPLE), 0, None, {})

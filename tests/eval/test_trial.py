@@ -85,9 +85,7 @@ def test_seeds_are_a_run_s_own_and_the_same_for_any_workers_and_after_an_interru
         for out, workers in ((one, 1), (two, 2), (tmp_path / "another.json", 1))
     )
     assert first.episodes == second.episodes
-    ends = [
-        {row.errors["tilt_error_deg"] for row in result.episodes} for result in (first, another)
-    ]
+    ends = [{row.errors["tilt_error_deg"] for row in result.episodes} for result in (first, another)]
     assert not ends[0] & ends[1]
     assert first.metadata.policy_kind == "module"
     assert first.metadata.policy_hash is not None
@@ -211,11 +209,10 @@ def test_the_score_is_the_episode_that_ends_at_the_goal() -> None:
 def test_past_the_goal_the_policy_plays_on_to_the_time_limit_and_settles() -> None:
     result = protocol.evaluate("expert", TASK, episodes=2)
     for row in result.episodes:
-        settled = row.settled
-        assert row.steps < settled.steps == TASKS[TASK].time_limit_steps
-        assert settled.errors["position_error_mm"] < 0.02
-        assert np.hypot(settled.x_mm, settled.y_mm) == pytest.approx(
-            settled.errors["lateral_error_mm"], abs=1e-5
+        assert row.steps < row.settled.steps == TASKS[TASK].time_limit_steps
+        assert row.settled.errors["position_error_mm"] < 0.02
+        assert np.hypot(row.settled.x_mm, row.settled.y_mm) == pytest.approx(
+            row.settled.errors["lateral_error_mm"], abs=1e-5
         )
     assert result.summary.settled.sharpest_95.errors["position_error_mm"] is not None
 
