@@ -85,7 +85,9 @@ def test_seeds_are_a_run_s_own_and_the_same_for_any_workers_and_after_an_interru
         for out, workers in ((one, 1), (two, 2), (tmp_path / "another.json", 1))
     )
     assert first.episodes == second.episodes
-    ends = [{row.errors["tilt_error_deg"] for row in result.episodes} for result in (first, another)]
+    ends = [
+        {row.errors["tilt_error_deg"] for row in result.episodes} for result in (first, another)
+    ]
     assert not ends[0] & ends[1]
     assert first.metadata.policy_kind == "module"
     assert first.metadata.policy_hash is not None
