@@ -38,6 +38,7 @@ MOST_PARQUET_BYTES = 2 * 2**30
 # Pictures are compressed already: parquet makes next to nothing of them.
 _PARQUET_EXPANSION = 20
 _PARQUET_ALLOWANCE_BYTES = 64 * 2**20
+_MOST_ROWS_AT_ONCE = 4096
 _PARQUET_TEXTS = ("BYTE_ARRAY", "FIXED_LEN_BYTE_ARRAY")
 # An Arrow value is 8 bytes at most, but for bytes, which count as what they unpack to.
 _ARROW_BYTES = 8
@@ -332,8 +333,8 @@ def read_parquet(
 ) -> "pa.Table":
     """Read a parquet file that unpacks to no more than it may.
 
-    Numbers are bounded by what the file says of itself. Strings and bytes are read row by row: a
-    file of a few bytes can name one long value for each of a million rows.
+    Numbers are bounded by what the file says of itself. Strings and bytes are read a few rows at a
+    time: a file of a few bytes can name one long value for each of a million rows.
 
     Args:
         path: The file.
@@ -373,8 +374,12 @@ def _read_texts(
     """Columns of strings or bytes; `most` bounds what they unpack to (bytes)."""
     import pyarrow as pa
 
+    # A value is no longer than what its column unpacks to: so many of them are no bomb yet.
+    groups = map(file.metadata.row_group, range(file.metadata.num_row_groups))
+    longest = max((group.total_byte_size for group in groups), default=0)
+    rows = min(max(1, _PARQUET_ALLOWANCE_BYTES // max(1, longest)), _MOST_ROWS_AT_ONCE)
     batches = []
-    for batch in file.iter_batches(1, columns=names):
+    for batch in file.iter_batches(rows, columns=names):
         most -= batch.nbytes
         if most < 0:
             raise error(f"{path}: unpacks to far more than its size; no recording does")

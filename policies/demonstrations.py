@@ -385,7 +385,7 @@ def _read_columns(manifest: Manifest) -> dict[str, Column]:
                 if values.shape[1:] != declared:
                     raise DatasetError(f"{key} has shape {values.shape[1:]}, not {declared}")
                 values = values.astype(np.float32)
-                astray = np.flatnonzero(~np.isfinite(values.reshape(len(values), -1)).all(axis=1))
+                astray = np.flatnonzero(~np.isfinite(values).all(axis=tuple(range(1, values.ndim))))
                 if len(astray):
                     raise DatasetError(
                         f"{key} holds NaN or infinity in {len(astray)} rows, row {astray[0]} "
