@@ -375,11 +375,12 @@ def figure(value: float | None) -> str:
 
 
 def _steps_over(result: Result, expert: Result) -> float | None:
-    theirs = {row.scenario: row.steps for row in expert.episodes if row.success}
-    both = [row for row in result.episodes if row.success and row.scenario in theirs]
-    if not both:
-        return None
-    return sum(row.steps for row in both) / sum(theirs[row.scenario] for row in both)
+    pairs = [
+        (own.steps_to_goal, theirs.steps_to_goal)
+        for own, theirs in zip(result.episodes, expert.episodes, strict=False)
+        if own.steps_to_goal is not None and theirs.steps_to_goal is not None
+    ]
+    return sum(own for own, _ in pairs) / sum(steps for _, steps in pairs) if pairs else None
 
 
 def escaped(text: str) -> str:

@@ -188,7 +188,7 @@ def compare(first: Path, second: Path) -> Comparison:
                 [theirs.settled.errors[name] for _, theirs in rows],
             )
             for name in registry.find(a.task).headline
-            if rows
+            if rows and all(name in row.errors for row in rows[0])
         },
         steps_to_goal=(
             statistics.paired_difference(
