@@ -86,9 +86,10 @@ def choose(result: Result) -> list[tuple[Kind, EpisodeRow]]:
     """Returns the typical success and the typical failure of a result, as far as it has them.
 
     Typical is the middle one: of successes by steps, of failures by where they ended. The best
-    would flatter, the worst would slander.
+    would flatter, the worst would slander. Clips are drawn from the action log, so it is the middle
+    one of the scenarios that it holds.
     """
-    rows = result.episodes
+    rows = result.episodes[: result.metadata.n_logged]
     headline = registry.find(result.summary.task).headline[0]
     won = sorted((r for r in rows if r.success), key=lambda r: (r.steps, r.scenario))
     lost = sorted(

@@ -19,8 +19,9 @@ import torch
 from hvs_suite import registry
 from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.errors import ResultError
-from hvs_suite.eval import action_log, result_file
+from hvs_suite.eval import result_file, verification
 from hvs_suite.eval.result_file import EpisodeRow
+from hvs_suite.eval.trial import play_trial
 from hvs_suite.names import shown
 from hvs_suite.policies.checkpoint import load_network, network_inputs, read_config
 from hvs_suite.rollout import Action, Observation, one_torch_thread
@@ -133,15 +134,23 @@ def sort_failures(
         PolicyError: The checkpoint is not of an `hvs` policy, or cannot be loaded.
     """
     result = result_file.load(path)
-    log = action_log.load(result_file.actions_path(path), result.metadata.actions_sha256)
+    log = verification.load_actions(path, result)
     network = None
     if checkpoint is not None:
         network = load_network(checkpoint, read_config(checkpoint))
     failures = []
     with contextlib.closing(registry.load(result.summary.task, split=result.summary.split)) as env:
-        for row, actions in zip(result.episodes, log, strict=True):
+        unlogged = None
+        if result.metadata.n_logged < len(result.episodes):
+            unlogged = verification.builtin_policy(path, result)(env)
+        for row in result.episodes:
             if row.success:
                 continue
+            if row.scenario < len(log):
+                actions = log[row.scenario]
+            else:
+                assert unlogged is not None
+                _, actions = play_trial(env, unlogged.reset, unlogged.select_action, row.scenario)
             failures.append(_sort(env, row, list(actions[: row.steps]), network))
             if progress is not None:
                 progress()

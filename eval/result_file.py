@@ -26,6 +26,8 @@ SHARPEST_PERCENT = 95.0
 MOST_BYTES = 16 * 2**20
 """Largest file that is read: a hundred times one of 1,000 scenarios."""
 MOST_EPISODES = 100_000
+MOST_COLUMNS = 100
+"""Columns that are read: three times those of any task. Each becomes a value of every row."""
 
 Count = Annotated[int, pydantic.Field(ge=0)]
 Error = Annotated[float, pydantic.Field(ge=0.0, allow_inf_nan=False)]
@@ -430,6 +432,8 @@ class Result(_Block):
     @pydantic.model_validator(mode="after")
     def _agree(self) -> Self:
         """Refuses rows that are not alike, and a summary that is not theirs."""
+        if [row.scenario for row in self.episodes] != list(range(len(self.episodes))):
+            raise ValueError("episodes are scenarios 0..N-1, in this order")
         metrics = self.episodes[0].errors.keys()
         if any(row.errors.keys() != metrics for row in self.episodes):
             raise ValueError("all rows must have the same metrics")
@@ -519,6 +523,10 @@ def _rows(columns: Mapping[str, Any], n: int) -> list[dict[str, Any]]:
     return [{name: values[i] for name, values in spread.items()} for i in range(n)]
 
 
+def _n_columns(columns: Mapping[str, Any]) -> int:
+    return sum(_n_columns(c) if isinstance(c, dict) else 1 for c in columns.values()) + 1
+
+
 def _text(columns: Mapping[str, Any], indent: str) -> str:
     """Columns as JSON, one a line: readable, and a difference shows in which column it is."""
     lines = [
@@ -579,6 +587,8 @@ def _episodes(path: Path, content: Mapping[str, Any]) -> list[dict[str, Any]]:
     n = summary.get("n_episodes") if isinstance(summary, dict) else None
     if not isinstance(columns, dict) or not isinstance(n, int) or not 0 < n <= MOST_EPISODES:
         raise ResultError(f"{path}: holds no columns of episodes; evaluate again")
+    if _n_columns(columns) > MOST_COLUMNS:
+        raise ResultError(f"{path}: holds more than {MOST_COLUMNS} columns of episodes")
     try:
         rows = _rows(columns, n)
     except ValueError as error:

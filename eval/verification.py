@@ -22,7 +22,8 @@ from hvs_suite.eval import action_log, contender, result_file
 from hvs_suite.eval.protocol import MakeTask
 from hvs_suite.eval.result_file import EpisodeRow, Result
 from hvs_suite.eval.trial import EpisodeLostError, Stage, outcome, play_trial, same_outcome
-from hvs_suite.policies import builtin
+from hvs_suite.names import shown
+from hvs_suite.policies import builtin, catalogue
 from hvs_suite.rollout import Action, Observation
 from hvs_suite.tasks.shared import lock
 
@@ -148,7 +149,7 @@ def verify(
         nonce = new_nonce() if nonce is None else nonce
         chosen = drawn(len(rows), sample, nonce)
     n_near, largest = 0, {"mm": 0.0, "deg": 0.0}
-    for scenarios, make, pictures in _in_parts(result, chosen, len(log)):
+    for scenarios, make, pictures in _in_parts(path, result, chosen, len(log)):
         replay = ReplayTrial(
             {index: log[index] for index in scenarios if index < len(log)},
             {index: rows[index] for index in scenarios},
@@ -172,7 +173,7 @@ def verify(
 
 
 def _in_parts(
-    result: Result, chosen: Sequence[int], n_logged: int
+    path: Path, result: Result, chosen: Sequence[int], n_logged: int
 ) -> Iterator[tuple[list[int], rollout.PolicyFactory, bool]]:
     """What is logged is replayed without pictures; a built-in policy plays the rest itself."""
     logged = [index for index in chosen if index < n_logged]
@@ -180,8 +181,27 @@ def _in_parts(
         yield logged, builtin.make_zero, False
     rest = [index for index in chosen if index >= n_logged]
     if rest:
-        policy, task = result.summary.policy, result.summary.task
-        yield rest, contender.find(policy, task).make, True
+        yield rest, builtin_policy(path, result), True
+
+
+def builtin_policy(path: Path, result: Result) -> rollout.PolicyFactory:
+    """Returns the built-in policy that a result names.
+
+    Args:
+        path: The result's file.
+        result: What it holds.
+
+    Raises:
+        ResultError: There is none of this name. Any other name is not looked for: a stranger's file
+            must not choose code to run or weights to load.
+    """
+    policy = result.summary.policy
+    if policy not in catalogue.BUILTIN:
+        raise ResultError(
+            f"{path}: {shown(policy)!r} is no built-in policy, but the action log does not hold "
+            "all scenarios; evaluate again"
+        )
+    return contender.find(policy, result.summary.task).make
 
 
 def check_task(path: Path, result: Result) -> None:
@@ -203,6 +223,7 @@ def check_task(path: Path, result: Result) -> None:
         ("task_digest", metadata.task_digest, lock.digest(ours)),
         ("tolerances", metadata.tolerances, spec.tolerances),
         ("time_limit_steps", metadata.time_limit_steps, spec.time_limit_steps),
+        ("metrics", sorted(result.episodes[0].errors), sorted(m.name for m in spec.metrics)),
     ):
         if said != known:
             raise ResultError(
