@@ -46,8 +46,9 @@ def test_a_failure_has_its_cause(policy, cause, tmp_path):
         (None, [900.0, 90.0], Cause.SLOW),
     ],
 )
-def test_an_estimate_and_the_last_steps_tell_eye_from_hand(estimate_mm, distances_m, cause):
-    lost = row(0, success=False, error=distances_m[-1])
+def test_an_estimate_and_the_last_steps_tell_eye_from_hand(estimate_mm, distances_mm, cause):
+    lost = row(0, success=False, error=distances_mm[-1])
+    distances_m = [distance / 1000 for distance in distances_mm]
     assert cause_of(lost, hvs_suite.TASKS[TASK], 3, estimate_mm, distances_m) is cause
 
 
