@@ -38,7 +38,7 @@ def test_a_failure_has_its_cause(policy, cause, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("estimate_mm", "distances_m", "cause"),
+    ("estimate_mm", "distances_mm", "cause"),
     [
         (7.0, [900.0, 30.0, 8.0, 7.0, 7.0], Cause.MISPLACED),
         (0.5, [900.0, 90.0, 60.0, 30.0, 9.0], Cause.SLOW),

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from columns import put_rows, rows_of
 
 from hvs_suite.errors import OutputError, ResultError
 from hvs_suite.eval import result_file
@@ -13,48 +12,50 @@ from hvs_suite.eval import result_file
 TOLERANCES = {"position_error_mm": 5.0, "tilt_error_deg": 5.0}
 
 
-METRICS = ("position_error_mm", "lateral_error_mm", "height_error_mm", "tilt_error_deg")
-
-
-def row(scenario: int, *, success: bool, error: float, **changes: Any) -> result_file.EpisodeRow:
-    """A row; ``settled_<name>`` changes what is settled."""
-    steps = 10 + scenario
-    settled = error / 10 if success else error
-    settled_changes = {
-        name.removeprefix("settled_"): changes.pop(name)
-        for name in list(changes)
-        if name.startswith("settled_")
+def errors_of(error: float) -> dict[str, float]:
+    return {
+        "position_error_mm": error,
+        "lateral_error_mm": error,
+        "height_error_mm": 0.0,
+        "tilt_error_deg": 2 * error,
     }
+
+
+def row(
+    scenario: int, *, success: bool, error: float, settled: Any = None, **changes: Any
+) -> result_file.EpisodeRow:
+    """A row; `settled` changes where it ended, which without success is what it was scored on."""
+    steps = 10 + scenario
+    collision = not success and scenario % 2 == 1
     values: dict[str, Any] = {
         "scenario": scenario,
         "success": success,
         "success_once": success,
-        "collision": not success and scenario % 2 == 1,
-        "truncated": not success and scenario % 2 == 0,
+        "collision": collision,
+        "truncated": not success and not collision,
         "steps": steps,
         "steps_to_goal": steps if success else None,
         "n_clipped": scenario,
         "failure": None,
-        "errors": errors(error),
-        "settled": {
-            "steps": 20 if success else steps,
-            "collision": not success and scenario % 2 == 1,
-            "failure": None,
-            "errors": errors(settled),
-            "x_mm": settled,
-            "y_mm": 0.0,
-        }
-        | settled_changes,
+        "errors": errors_of(error),
+    } | changes
+    rest = error / 10 if success else error
+    end = {
+        "steps": 20 if success else values["steps"],
+        "collision": values["collision"],
+        "failure": values["failure"],
+        "errors": errors_of(rest),
+        "x_mm": rest,
+        "y_mm": 0.0,
     }
-    return result_file.EpisodeRow.model_validate(values | changes)
-
-
-def errors(error: float) -> dict[str, float]:
-    return dict(zip(METRICS, (error, error, 0.0, 2 * error), strict=True))
+    return result_file.EpisodeRow(**values, settled=end | (settled or {}))
 
 
 def make_result(n: int = 5, **summary: Any) -> result_file.Result:
-    rows = [row(i, success=i < 3, error=float(i) / 3) for i in range(n)]
+    return of_rows([row(i, success=i < 3, error=float(i) / 3) for i in range(n)], **summary)
+
+
+def of_rows(rows: list[result_file.EpisodeRow], **summary: Any) -> result_file.Result:
     names = {"task": "align-easy", "policy": "zero", "split": "test"} | summary
     return result_file.Result(
         schema_version=result_file.SCHEMA_VERSION,
@@ -76,7 +77,7 @@ def make_result(n: int = 5, **summary: Any) -> result_file.Result:
             training_hours=None,
             decision_limit_s=10.0,
             actions_sha256=64 * "0",
-            n_logged=n,
+            n_logged=len(rows),
             packages={"numpy": "2.2.6"},
             gl_renderer="llvmpipe",
             cpu="a processor",
@@ -121,7 +122,7 @@ def test_success_against_steps_ends_at_the_success_rate() -> None:
 
 
 def test_the_reasons_of_lost_episodes_are_counted() -> None:
-    lost = {"truncated": False, "failure": "not finite", "settled_failure": "not finite"}
+    lost = {"truncated": False, "failure": "not finite"}
     rows = [row(0, success=False, error=1.0, **lost), row(2, success=False, error=1.0)]
     summary = result_file.Summary.of(
         "t", "p", "test", rows, tolerances=TOLERANCES, time_limit_steps=20
@@ -137,26 +138,60 @@ def test_a_written_result_reads_back_the_same(tmp_path: Path) -> None:
     assert [file.name for file in path.parent.iterdir()] == ["align-easy.json"]
 
 
-def test_each_column_stands_on_its_own_line_and_repeats_nothing(tmp_path: Path) -> None:
+def test_a_bound_of_0_has_no_multiples() -> None:
+    rows = [row(i, success=i < 3, error=float(i)) for i in range(5)]
+    settled = result_file.SettledSummary.of(rows, {"position_error_mm": 0.0})
+    assert settled.success_by_scale is None
+    assert settled.sharpest_95.scale is None
+    assert settled.errors["position_error_mm"].p50 == pytest.approx(0.2)
+
+
+def test_a_goal_may_come_before_the_last_scored_step() -> None:
+    rows = [row(0, success=True, error=1.0, steps=20, steps_to_goal=12)]
+    summary = result_file.Summary.of(
+        "t", "p", "test", rows, tolerances=TOLERANCES, time_limit_steps=20
+    )
+    assert summary.steps_to_goal_mean == 12.0
+    assert summary.success_by_step[10:12] == [0.0, 100.0]
+
+
+def test_each_column_stands_on_its_own_line_and_what_never_differs_is_said_once(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "result.json"
     result_file.write(make_result(), path)
     columns = json.loads(path.read_text())["episodes"]
-    assert columns["success"] == [True, True, True, False, False]
-    assert columns["failure"] is None
+    assert columns["steps"] == [10, 11, 12, 13, 14]
     assert columns["errors"]["height_error_mm"] == 0.0
+    assert columns["failure"] is None
     assert "scenario" not in columns
-    assert "failure" not in columns["settled"]
-    lines = [line.strip() for line in path.read_text().splitlines()]
-    assert '"steps": [10,11,12,13,14],' in lines
+    # Three of five played on past the goal; none of them collided there.
+    assert columns["settled"]["steps"] == [20, 20, 20, 13, 14]
+    assert "collision" not in columns["settled"]
+    lines = [line.strip().removesuffix(",") for line in path.read_text().splitlines()]
+    assert '"steps": [10,11,12,13,14]' in lines
+    assert '"height_error_mm": 0.0' in lines
 
 
-def test_a_task_with_a_tolerance_of_zero_has_no_curve() -> None:
-    rows = [row(0, success=True, error=0.0)]
-    summary = result_file.Summary.of(
-        "t", "p", "test", rows, tolerances={"tilt_error_deg": 0.0}, time_limit_steps=20
-    )
-    assert summary.settled.success_by_scale is None
-    assert summary.settled.sharpest_95.scale is None
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [row(0, success=True, error=1.0)],
+        [row(i, success=False, error=1.0 + i) for i in range(4)],
+        [row(i, success=True, error=0.5, settled={"steps": 30 + i}) for i in range(3)],
+        [
+            row(0, success=True, error=1.0, settled={"collision": True}),
+            row(1, success=True, error=1.0, settled={"failure": "too slow"}),
+        ],
+    ],
+    ids=["one", "none played on", "equal but for the end", "lost after the goal"],
+)
+def test_columns_read_back_as_the_rows_that_were_written(
+    rows: list[result_file.EpisodeRow], tmp_path: Path
+) -> None:
+    path = tmp_path / "result.json"
+    result_file.write(of_rows(rows), path)
+    assert result_file.load(path).episodes == rows
 
 
 def test_a_result_cannot_be_written_below_a_file(tmp_path: Path) -> None:
@@ -165,49 +200,71 @@ def test_a_result_cannot_be_written_below_a_file(tmp_path: Path) -> None:
         result_file.write(make_result(), tmp_path / "file" / "result.json")
 
 
-def in_row(index: int, **changes: Any) -> Any:
-    """Changes a row of a file."""
-
-    def tamper(content: Any) -> None:
-        rows = rows_of(content)
-        for name, value in changes.items():
-            if isinstance(value, dict):
-                rows[index][name] |= value
-            else:
-                rows[index][name] = value
-        put_rows(content, rows)
-
-    return tamper
-
-
 BROKEN: dict[str, tuple[Any, str]] = {
     "missing block": (lambda c: c.pop("metadata"), "metadata: Field required"),
     "unknown key": (lambda c: c["summary"].update(extra=1), "summary.extra"),
     "other schema": (lambda c: c.update(schema_version=99), "schema_version is 99"),
     "no schema": (lambda c: c.pop("schema_version"), "schema_version is None"),
-    "rows for columns": (lambda c: c.update(episodes=[]), "holds no columns of episodes"),
-    "no rows": (lambda c: c["summary"].update(n_episodes=0), "holds no columns of episodes"),
-    "a billion rows": (
-        lambda c: c["summary"].update(n_episodes=10**9),
-        "holds no columns of episodes",
-    ),
-    "a column that is too short": (
-        lambda c: c["episodes"]["steps"].pop(),
-        "steps holds 4 values for 5 episodes",
-    ),
-    "a column too many": (lambda c: c["episodes"].update(extra=1), "episodes.0.extra"),
-    "text for a number": (in_row(0, steps="10"), "episodes.0.steps"),
+    "no rows": (lambda c: c.update(episodes=[]), "holds no columns of episodes"),
+    "text for a number": (lambda c: c["episodes"].update(steps=5 * ["10"]), "episodes.0.steps"),
     "a negative error": (
-        in_row(0, errors={"tilt_error_deg": -1.0}),
+        lambda c: c["episodes"]["errors"].update(tilt_error_deg=-1.0),
         "episodes.0.errors.tilt_error_deg",
     ),
     "an infinite error": (
-        in_row(0, errors={"tilt_error_deg": float("inf")}),
+        lambda c: c["episodes"]["errors"].update(tilt_error_deg=float("inf")),
         "Infinity is no number",
     ),
-    "a success without its steps": (in_row(0, steps_to_goal=None), "null otherwise"),
-    "more steps to the goal than steps": (in_row(0, steps_to_goal=99), "between 1 and steps"),
-    "two ends": (in_row(0, collision=True), "an episode has one end"),
+    "a column that is too short": (
+        lambda c: c["episodes"]["steps"].pop(),
+        "episodes: steps holds 4 values for 5 episodes",
+    ),
+    "a column of a metric that is too long": (
+        lambda c: c["episodes"]["errors"]["tilt_error_deg"].append(1.0),
+        "episodes: tilt_error_deg holds 6 values for 5 episodes",
+    ),
+    "a column left out": (lambda c: c["episodes"].pop("steps"), "episodes.0.steps"),
+    "a column too many": (lambda c: c["episodes"].update(extra=1), "episodes.0.extra"),
+    "scenarios of its own": (
+        lambda c: c["episodes"].update(scenario=[0, 0, 1, 2, 3]),
+        "are scenarios 0..N-1",
+    ),
+    "more columns than any task has": (
+        lambda c: c["episodes"]["errors"].update({f"error_{k}_mm": 0.0 for k in range(1000)}),
+        "columns of episodes",
+    ),
+    "more episodes than rows": (
+        lambda c: c["summary"].update(n_episodes=6),
+        "values for 6 episodes",
+    ),
+    "episodes without number": (
+        lambda c: c["summary"].update(n_episodes=10**9),
+        "holds no columns of episodes",
+    ),
+    "a metric without its settled figure": (
+        lambda c: c["episodes"]["settled"]["errors"].pop("tilt_error_deg"),
+        "must have the metrics of errors",
+    ),
+    "a log of fewer scenarios, of no built-in policy": (
+        lambda c: c["metadata"].update(n_logged=3, policy_kind="module"),
+        "n_logged must be the number of rows",
+    ),
+    "a log of more scenarios": (
+        lambda c: c["metadata"].update(n_logged=6),
+        "n_logged must be the number of rows",
+    ),
+    "a success without its steps": (
+        lambda c: c["episodes"].update(steps_to_goal=[None, 11, 12, None, None]),
+        "steps_to_goal is a number for a success",
+    ),
+    "a goal after the last step": (
+        lambda c: c["episodes"].update(steps_to_goal=[11, 11, 12, None, None]),
+        "steps_to_goal must lie between 1 and steps",
+    ),
+    "two ends": (
+        lambda c: c["episodes"]["collision"].__setitem__(0, True),
+        "an episode has one end",
+    ),
     "a flattered summary": (
         lambda c: c["summary"].update(pc_success=100.0),
         "summary.pc_success is not what the episodes give",
@@ -217,7 +274,7 @@ BROKEN: dict[str, tuple[Any, str]] = {
         "summary.errors is not",
     ),
     "a settled figure that is not the episode's": (
-        in_row(4, errors={"position_error_mm": 0.0}),
+        lambda c: c["episodes"]["errors"]["position_error_mm"].__setitem__(4, 0.0),
         "settled figures must be the episode's own",
     ),
     "another version of a package": (
@@ -227,13 +284,12 @@ BROKEN: dict[str, tuple[Any, str]] = {
     "no seal": (lambda c: c.pop("sha256"), "was changed after it was written"),
     "a bound on nothing": (
         lambda c: c["metadata"].update(tolerances={"yaw": 1.0}),
-        "bounds what is no metric",
+        "tolerances bounds what is no metric",
     ),
-    "a log that is too short for a policy of one's own": (
-        lambda c: c["metadata"].update(n_logged=2, policy_kind="module"),
-        "n_logged must be the number of rows",
+    "a flattered row": (
+        lambda c: c["episodes"]["errors"]["position_error_mm"].__setitem__(2, 0.0),
+        "summary.errors is not",
     ),
-    "a flattered row": (in_row(2, errors={"position_error_mm": 0.0}), "summary.errors is not"),
 }
 
 

@@ -150,7 +150,7 @@ OUT, IN, JUST_OUT, JUST_IN = 50.0, -50.0, NEAR / 2, -NEAR / 2
 
 
 @pytest.mark.parametrize(
-    ("errors_mm", "claimed"),
+    ("played", "claimed"),
     [
         ([OUT, IN, JUST_OUT, OUT], [OUT, IN, IN, OUT]),
         ([OUT, IN, JUST_IN, OUT], [OUT, IN, OUT, OUT]),
@@ -162,7 +162,7 @@ OUT, IN, JUST_OUT, JUST_IN = 50.0, -50.0, NEAR / 2, -NEAR / 2
     ],
 )
 def test_rounding_excuses_the_outcome_that_it_can_have_made(
-    errors_mm: list[float], claimed: list[float]
+    played: list[float], claimed: list[float]
 ) -> None:
     said, actions = outcome_of(Script(claimed))
     stage = Script(played)
@@ -173,7 +173,7 @@ def test_rounding_excuses_the_outcome_that_it_can_have_made(
 
 
 @pytest.mark.parametrize(
-    ("errors_mm", "claimed"),
+    ("played", "claimed"),
     [
         # Near a bound in another step than those that would have to be inside.
         ([JUST_OUT, OUT, OUT, OUT], [IN, IN, OUT, OUT]),
