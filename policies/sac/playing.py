@@ -17,6 +17,7 @@ from gymnasium import spaces
 
 from hvs_suite.errors import PolicyError
 from hvs_suite.files import replacing
+from hvs_suite.policies.trained_for import check_trained_for, trained_for
 from hvs_suite.rollout import Observation, one_torch_thread
 from hvs_suite.tasks.shared.spec import Spec, observation_names
 
@@ -126,6 +127,7 @@ def write_config(
         "type": TYPE,
         "format": 1,
         "task": spec.name,
+        **trained_for(spec).model_dump(),
         "action_mode": spec.action_mode,
         "inputs": inputs,
         "hidden": list(hidden),
@@ -169,7 +171,7 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def check_fit(config: Mapping[str, Any], folder: Path, spec: Spec) -> None:
-    """Check that a task shows what the actor reads, in the same size, and takes its actions.
+    """Check that a task is what the actor was trained for, shows what it reads, takes its actions.
 
     Args:
         config: As `read_config` returns it.
@@ -179,6 +181,7 @@ def check_fit(config: Mapping[str, Any], folder: Path, spec: Spec) -> None:
     Raises:
         PolicyError: It does not fit, or the file is damaged.
     """
+    check_trained_for(config, folder, spec)
     shown = observation_names(spec.observations)
     mismatch = f"{folder} does not fit {spec.name}: "
     try:
