@@ -39,6 +39,7 @@ from hvs_suite.policies.hvs.network import (
     HvsNetwork,
     shape_from_config,
 )
+from hvs_suite.policies.trained_for import check_trained_for
 from hvs_suite.rollout import Observation, one_torch_thread
 from hvs_suite.tasks.shared.spec import Spec, observation_names
 
@@ -174,6 +175,8 @@ def _one(
 def check_fit(config: Mapping[str, Any], folder: Path, spec: Spec) -> None:
     """Check that a task shows what a checkpoint reads, in the same size, and takes its actions.
 
+    One of type `hvs` also has to be trained for such tasks; see `check_trained_for`.
+
     Args:
         config: Of the checkpoint.
         folder: The checkpoint, for the message.
@@ -182,6 +185,8 @@ def check_fit(config: Mapping[str, Any], folder: Path, spec: Spec) -> None:
     Raises:
         PolicyError: It does not fit.
     """
+    if config.get("type") == "hvs":
+        check_trained_for(config, folder, spec)
     shown = observation_names(spec.observations)
     mismatch = f"{folder} does not fit {spec.name}: "
     if spec.action_mode != "joint_position" or spec.normalise_observation:

@@ -200,6 +200,7 @@ def pretrain(
             {"minutes": minutes, "steps": steps},
             PACKAGES,
             data=str(data),
+            options=dict(manifest.options),
             policy={
                 "type": "hvs",
                 "channels": policy.config.channels,

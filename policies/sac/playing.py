@@ -26,6 +26,7 @@ from hvs_suite.policies.checkpoint_files import (
     read_settings,
     read_shapes,
 )
+from hvs_suite.policies.trained_for import TrainedFor, check_trained_for, trained_for
 from hvs_suite.rollout import Observation, one_torch_thread
 from hvs_suite.tasks.shared.spec import Spec, observation_names
 
@@ -63,7 +64,7 @@ class Input(pydantic.BaseModel):
         return self
 
 
-class Config(pydantic.BaseModel):
+class Config(TrainedFor):
     """A folder's ``config.json``.
 
     Attributes:
@@ -178,6 +179,7 @@ def write_config(
         "type": TYPE,
         "format": 1,
         "task": spec.name,
+        **trained_for(spec).model_dump(),
         "action_mode": spec.action_mode,
         "inputs": inputs,
         "hidden": list(hidden),
@@ -223,7 +225,7 @@ def read_config(folder: Path) -> Config:
 
 
 def check_fit(config: Config, folder: Path, spec: Spec) -> None:
-    """Check that a task shows what the actor reads, in the same size, and takes its actions.
+    """Check that a task is what the actor was trained for, shows what it reads, takes its actions.
 
     Args:
         config: As `read_config` returns it.
@@ -233,6 +235,7 @@ def check_fit(config: Config, folder: Path, spec: Spec) -> None:
     Raises:
         PolicyError: It does not fit.
     """
+    check_trained_for(config.model_dump(), folder, spec)
     shown = observation_names(spec.observations)
     mismatch = f"{folder} does not fit {spec.name}: "
     if spec.normalise_observation or spec.action_mode != config.action_mode:
