@@ -88,7 +88,7 @@ class Episode:
         collision: A forbidden contact ended the episode.
         truncated: The time limit ended the episode.
         steps: Control steps played.
-        steps_to_goal: Control steps up to and including success; None for failures.
+        steps_to_goal: Control steps to the goal, as the task counts them; None for failures.
         n_clipped: Control steps whose action had a component outside the action bounds.
         errors: The task's metrics at the end of the last step, by name.
         actions: (steps, 7) float32, as the policy gave them, before clipping.
@@ -156,7 +156,7 @@ def run_episode(
         collision=bool(info["collision"]),
         truncated=bool(info["truncated"]),
         steps=len(actions),
-        steps_to_goal=len(actions) if success else None,
+        steps_to_goal=info["steps_to_goal"],
         n_clipped=n_clipped,
         errors={name: float(value) for name, value in info["errors"].items()},
         actions=np.array(actions, dtype=np.float32).reshape(-1, *spec.shape),

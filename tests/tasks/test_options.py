@@ -18,7 +18,7 @@ from hvs_suite.tasks.shared.spec import JOINT_LIMITS_DEG
         ("align-thesi", "did you mean align-thesis"),
         ("algn-hard", "align-hard"),
         ("align_easy", "align-easy"),
-        ("reach", "choose from align-fixed, align-easy"),
+        ("juggle", "choose from align-fixed, align-easy"),
         ("", "choose from"),
     ],
 )
@@ -193,8 +193,8 @@ def test_named_tasks_mean_what_the_table_of_tasks_says() -> None:
     own = {"align": "goal", "sequence": "target_steps", "track": "motion"}
     rows = {
         name: (
-            v.start, getattr(v, own[v.family]), v.target_diameter_m, v.position_tolerance_mm, v.lateral_tolerance_mm,
-            v.height_tolerance_mm, v.tilt_tolerance_deg, v.hold_steps, v.time_limit_steps,
+            v.start, getattr(v, own[v.family]), v.target_diameter_m, v.position_tolerance_mm,
+            v.lateral_tolerance_mm, v.height_tolerance_mm, v.tilt_tolerance_deg, v.hold_steps, v.time_limit_steps,
         )
         for name, v in tasks.items()
     }  # fmt: skip
