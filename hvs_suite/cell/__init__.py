@@ -1,4 +1,4 @@
-"""The robot cell: the iiwa 7, its two cameras, work surface, markers and environment loop."""
+"""The robot cell: the iiwa 7, its two cameras, work surface and markers."""
 
 from hvs_suite.cell.gl import choose_backend
 

@@ -10,12 +10,14 @@ import importlib
 import inspect
 import io
 import logging
+import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Protocol
 
 from hvs_suite.cli import streams
-from hvs_suite.errors import HvsError
+from hvs_suite.errors import HvsError, OptionError
 from hvs_suite.names import shown
 
 # Name -> where its dataclass lives. Those modules import nothing heavy at the top, so that
@@ -107,8 +109,10 @@ def parse(arguments: Sequence[str]) -> Command:
     """Build the command that the words ask for.
 
     Raises:
+        OptionError: A plugin cannot be imported.
         SystemExit: After help (0), or after one line about words that make no sense (2).
     """
+    arguments = _import_plugins(arguments)
     if not arguments:
         complain(f"name a command: {', '.join(COMMANDS)}; see 'hvs --help'")
         raise SystemExit(USER_ERROR)
@@ -141,6 +145,34 @@ def parse(arguments: Sequence[str]) -> Command:
     return command
 
 
+def _import_plugins(arguments: Sequence[str]) -> Sequence[str]:
+    """Import the modules that ``--plugin MODULE`` before the command names; the words after them.
+
+    Worker processes find them in the environment and import them too.
+
+    Raises:
+        OptionError: One of them cannot be imported.
+    """
+    modules = []
+    while arguments and arguments[0].partition("=")[0] == "--plugin":
+        name, equals, module = arguments[0].partition("=")
+        arguments = arguments[1:]
+        if not equals:
+            module, arguments = next(iter(arguments), ""), arguments[1:]
+        if not all(word.isidentifier() for word in module.split(".")):
+            raise OptionError(f"{name} names a module such as my_tasks, not {module!r}")
+        modules.append(module)
+    if modules:
+        from hvs_suite.tasks.shared.family import PLUGINS, import_family
+
+        # As for Python's own -m, a module may lie where the command is given.
+        sys.path.insert(0, str(Path.cwd()))
+        for module in modules:
+            import_family(module)
+        os.environ[PLUGINS] = ",".join(filter(None, [os.environ.get(PLUGINS), *modules]))
+    return arguments
+
+
 def _load(where: str) -> Any:
     """Import the dataclass named ``module:Class``."""
     module, _, name = where.partition(":")
@@ -150,7 +182,7 @@ def _load(where: str) -> Any:
 def _overview() -> str:
     """Help of ``hvs`` itself: each command with the first line of its description."""
     lines = [
-        "usage: hvs COMMAND [OPTIONS]",
+        "usage: hvs [--plugin MODULE] COMMAND [OPTIONS]",
         "",
         "Benchmark suite for hybrid visual servoing with a KUKA LBR iiwa 7.",
         "",
@@ -158,7 +190,12 @@ def _overview() -> str:
     for name, where in COMMANDS.items():
         summary = (inspect.getdoc(_load(where)) or "").partition("\n")[0]
         lines.append(f"  {name:<16}{summary}")
-    return "\n".join([*lines, "", "'hvs COMMAND --help' explains the options of a command."])
+    lines += [
+        "",
+        "'hvs COMMAND --help' explains the options of a command; --plugin imports a module that",
+        "registers tasks of your own.",
+    ]
+    return "\n".join(lines)
 
 
 def _reason(box: str) -> str:

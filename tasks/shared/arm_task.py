@@ -4,6 +4,9 @@
 few methods (see `hvs_suite.tasks.shared.family`).
 """
 
+import hvs_suite.cell  # noqa: F401 - chooses the OpenGL backend before MuJoCo is imported
+
+# isort: split
 from collections.abc import Mapping
 from typing import Any, Protocol
 

@@ -11,6 +11,9 @@ What differs from ``composer.Environment``, and why:
 * nothing is drawn before the first ``reset``, so that processes may fork until then.
 """
 
+import hvs_suite.cell  # noqa: F401 - chooses the OpenGL backend before MuJoCo is imported
+
+# isort: split
 import dataclasses
 import weakref
 from collections.abc import Mapping, Sequence

@@ -10,7 +10,10 @@ Families of other packages are found by the entry point group ``hvs_suite.famili
 
 import abc
 import dataclasses
+import importlib
 import importlib.metadata
+import os
+import warnings
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -18,7 +21,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from hvs_suite.errors import OptionError
+from hvs_suite.errors import OptionError, describe
 from hvs_suite.tasks.shared.goal import Goal, Keypoint, Tip
 from hvs_suite.tasks.shared.spec import Spec
 
@@ -34,6 +37,7 @@ if TYPE_CHECKING:
 FloatArray = npt.NDArray[np.float64]
 
 ENTRY_POINTS = "hvs_suite.families"
+PLUGINS = "HVS_PLUGINS"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -207,9 +211,30 @@ def registered() -> Mapping[str, Registered]:
 
 
 def discover() -> None:
-    """Import the families of other installed packages, which register their tasks.
+    """Import the families of others, which register their tasks.
 
-    A package names its modules in the entry point group ``hvs_suite.families``.
+    An installed package names its modules in the entry point group ``hvs_suite.families``; modules
+    to try are named, separated by commas, in the environment variable ``HVS_PLUGINS``, which
+    worker processes inherit. What cannot be imported is warned of: our own tasks do without it.
     """
-    for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
-        entry.load()
+    modules = [entry.value for entry in importlib.metadata.entry_points(group=ENTRY_POINTS)]
+    modules += filter(None, os.environ.get(PLUGINS, "").split(","))
+    for module in modules:
+        try:
+            import_family(module)
+        except OptionError as error:
+            warnings.warn(f"{error}; its tasks are missing", stacklevel=2)
+
+
+def import_family(module: str) -> None:
+    """Import a module that registers tasks.
+
+    Raises:
+        OptionError: It cannot be imported.
+    """
+    try:
+        # Others import dm_control at the top; the OpenGL backend has to be chosen before that.
+        importlib.import_module("hvs_suite.cell")
+        importlib.import_module(module)
+    except (Exception, SystemExit) as error:  # somebody else's module raises anything
+        raise OptionError(f"cannot import the tasks of {module}: {describe(error)}") from error

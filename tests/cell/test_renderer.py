@@ -198,6 +198,33 @@ def test_a_process_may_fork_after_drawing(named: Named) -> None:
             child.kill()
 
 
+_FORK = """
+import os
+import hvs_suite
+with hvs_suite.load("align-easy", split="test") as env:
+    env.reset(scenario=3)
+    child = os.fork()
+    if not child:
+        hvs_suite.load("align-easy", split="test").reset(scenario=3)
+        os._exit(0)
+    print(os.waitpid(child, 0)[1])
+"""
+
+
+@pytest.mark.parametrize("asked", [{}, {"MUJOCO_GL": "egl"}], ids=["chosen", "asked for"])
+def test_the_backend_is_chosen_before_mujoco_is_imported(asked: dict[str, str]) -> None:
+    """Else dm_control tries, and complains of, one that needs a display, and forks hang."""
+    variables = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "LP_NUM_THREADS")}
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore::DeprecationWarning", "-c", _FORK],
+        env=variables | asked,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert (done.stdout, done.stderr, done.returncode) == ("0\n", "", 0)
+
+
 _WITHOUT_GL = """
 import hvs_suite
 from hvs_suite.errors import RenderError

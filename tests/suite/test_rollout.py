@@ -137,7 +137,7 @@ def test_failure_has_no_steps_to_goal() -> None:
     episode = run_episode(Counter(), Echo(Counter()), 9)
     assert (episode.success, episode.truncated, episode.steps) == (False, True, LIMIT)
     assert episode.steps_to_goal is None
-    assert episode.position_error_mm == 9.0
+    assert episode.errors["position_error_mm"] == 9.0
 
 
 def test_actions_out_of_range_are_clipped_and_their_steps_counted() -> None:
