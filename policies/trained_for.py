@@ -54,7 +54,7 @@ _FREE = frozenset(
 )
 
 
-class TrainedFor(pydantic.BaseModel, frozen=True):
+class TrainedFor(pydantic.BaseModel):
     """What a policy was trained for.
 
     Attributes:
