@@ -23,7 +23,6 @@ from hvs_suite.tasks.shared.spec import Description, in_words, scene
 if TYPE_CHECKING:
     from dm_control import mjcf
 
-    from hvs_suite.cell.arena import Cell
     from hvs_suite.cell.surface import Surface
 
 FloatArray = npt.NDArray[np.float64]
@@ -93,9 +92,8 @@ class Align(Placing[AlignSpec, AlignScenario]):
         self._surface = Surface(shape=self.spec.surface, size_m=self.spec.surface_size_m)
         return self._surface
 
-    def build(self, cell: "Cell") -> None:
-        """Lay the marker; check what was asked for against the surface's shape."""
-        super().build(cell)
+    def check_reach(self) -> None:
+        """Check a goal that was asked for, or the ring of a level surface."""
         goal = self.spec.goal
         if isinstance(goal, tuple) and not is_reachable(self.goal_over(*goal)):
             raise OptionError(
@@ -103,7 +101,7 @@ class Align(Placing[AlignSpec, AlignScenario]):
                 "surface; choose a radius from 0.40 to 0.78 m"
             )
         if goal == "random" and self.spec.surface == "flat":
-            self.check_ring()
+            super().check_reach()
 
     def goal_over(self, x: float, y: float) -> Goal:
         """The goal over a point of the base plane (m)."""

@@ -156,9 +156,14 @@ class Placing[S: PlacingSpec, C: Scenario](Family[S, C]):
     """One marker, whose place is the goal; families say where it is and how it moves."""
 
     def build(self, cell: "Cell") -> None:
-        """Attach the marker, a mocap body, to the cell."""
+        """Attach the marker, a mocap body, to the cell; check what was asked for against it.
+
+        Raises:
+            OptionError: A goal that was asked for is out of reach.
+        """
         from hvs_suite.cell.marker import Marker
 
+        self.check_reach()
         self.marker = Marker(kind=self.spec.marker, diameter_m=self.spec.target_diameter_m)
         cell.add_marker(self.marker)
 
@@ -202,8 +207,8 @@ class Placing[S: PlacingSpec, C: Scenario](Family[S, C]):
         """The goal over a point of the level surface (m, base frame)."""
         return Goal(np.array([x, y, 0.0]), UP, self.spec.standoff_m)
 
-    def check_ring(self) -> None:
-        """Check that the whole ring on the level surface is within reach.
+    def check_reach(self) -> None:
+        """Check that all goals are within reach: the whole ring, over the level surface.
 
         Raises:
             OptionError: It is not.

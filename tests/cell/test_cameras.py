@@ -1,6 +1,7 @@
 """The cameras: what they promise (K, T) is what is drawn, for every named task."""
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -106,6 +107,45 @@ def test_the_projected_target_lies_where_eye_in_hand_shows_it(
             found.append(miss(env, "eih", magnify(env)))
     assert None not in found
     assert max(value for value in found if value is not None) <= MAX_MISS_PX
+
+
+@pytest.mark.parametrize(
+    ("task", "options", "steps"),
+    [
+        ("track-line", {}, 60),
+        ("track-curve", {}, 60),
+        ("sequence-thesis", {"n_targets": 3, "target_steps": 2}, 6),
+    ],
+)
+def test_the_projected_target_lies_where_it_is_drawn_at_every_moment(
+    magnify: Callable[[Environment], Renderer], task: str, options: dict[str, Any], steps: int
+) -> None:
+    """While it moves or changes, and again for the moments that pictures are drawn of later."""
+    with hvs_suite.load(task, split="test", **options) as env:
+        seen = [env.reset(scenario=2).observation["eth"]]
+        moments, misses, places = [env.moment()], [miss(env, "eth", magnify(env))], set()
+        for _ in range(steps):
+            seen.append(env.step(env.commandable(env.scenario.start)).observation["eth"])
+            if env.info["truncated"]:
+                break  # the last target of a sequence is gone
+            moments.append(env.moment())
+            misses.append(miss(env, "eth", magnify(env)))
+            places.add(tuple(env.goal().target))
+            u, v, _, visible = env.privileged()["target_eth"]
+            if visible:
+                camera = env.task.cameras["eth"]
+                at = (np.array([u, v]) + 1.0) / 2.0 * camera.resolution - 0.5
+                # The rim's centroid is not quite the projected centre: perspective.
+                assert np.linalg.norm(outline(env, "eth").mean(axis=0) - at) <= MAX_MISS_PX
+        found = [value for value in misses if value is not None]
+        assert len(found) >= 0.5 * len(misses)
+        assert max(found) <= MAX_MISS_PX
+        assert len(places) >= 3
+        drawn = env.pictures(moments)["eth"]
+        for later, then in zip(drawn, seen, strict=False):
+            np.testing.assert_array_equal(later, then)
+        # Drawing has left the scene as it was.
+        assert miss(env, "eth", magnify(env)) == misses[-1] or env.info["truncated"]
 
 
 @pytest.mark.each_task

@@ -200,9 +200,12 @@ def test_a_process_may_fork_after_drawing(named: Named) -> None:
 
 _FORK = """
 import os
+import warnings
 import hvs_suite
 with hvs_suite.load("align-easy", split="test") as env:
     env.reset(scenario=3)
+    # Python warns of every fork of a process that has threads.
+    warnings.simplefilter("ignore", DeprecationWarning)
     child = os.fork()
     if not child:
         hvs_suite.load("align-easy", split="test").reset(scenario=3)
@@ -216,7 +219,7 @@ def test_the_backend_is_chosen_before_mujoco_is_imported(asked: dict[str, str]) 
     """Else dm_control tries, and complains of, one that needs a display, and forks hang."""
     variables = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "LP_NUM_THREADS")}
     done = subprocess.run(
-        [sys.executable, "-W", "ignore::DeprecationWarning", "-c", _FORK],
+        [sys.executable, "-c", _FORK],
         env=variables | asked,
         capture_output=True,
         text=True,
