@@ -129,13 +129,8 @@ def test_a_check_that_fails_fails_the_certificate() -> None:
 
 def test_a_goal_beyond_the_arm_s_reach_would_be_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The thesis's own target distribution, per coordinate, fails the first question."""
-<<<<<<< HEAD
-    # Nobody gets as far as this: such a ring is refused at once.
-    monkeypatch.setattr(family_of("align-easy"), "check_ring", lambda self: None)
-=======
     # Loading such a task is refused, so certificates need not meet one.
     monkeypatch.setattr(Align, "check_reach", lambda self: None)
->>>>>>> h/f
     with hvs_suite.load(
         "align-easy", split="test", observations="state", ring_m=(0.40, 1.10)
     ) as env:
