@@ -40,6 +40,8 @@ SETTLING_STEPS = 20
 _N_SINES = 3
 _FREQUENCY_HZ = (0.05, 0.45)
 _MAX_REDRAWS = 10_000
+_CHECK_PERIOD_S = 0.1
+"""How often along a motion its place, speed and acceleration are looked at (s)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -50,6 +52,7 @@ class TrackSpec(PlacingSpec):
         motion: ``line``, straight at constant speed; ``curve``, a sum of three sines for each axis.
         speed_m_s: Least and largest speed (m/s): constant on a line, the largest on a curve.
         acceleration_m_s2: Largest acceleration on a curve (m/s^2).
+        motion_s: For how long the motion stays on the ring (s); the episode of the named task.
     """
 
     family: ClassVar[str] = "track"
@@ -62,6 +65,7 @@ class TrackSpec(PlacingSpec):
     motion: Literal["line", "curve"] = scene("line")
     speed_m_s: tuple[float, float] = scene((0.05, 0.15))
     acceleration_m_s2: float = scene(0.3)
+    motion_s: float = scene(6.0)
     hold_steps: int = 20
     time_limit_steps: int = 60
 
@@ -72,7 +76,7 @@ class TrackSpec(PlacingSpec):
             OptionError: One of them does not.
         """
         super().__post_init__()
-        self._check("must be positive", lambda value: value > 0, "acceleration_m_s2")
+        self._check("must be positive", lambda value: value > 0, "acceleration_m_s2", "motion_s")
         if not 0.0 < self.speed_m_s[0] <= self.speed_m_s[1]:
             raise OptionError(f"speed_m_s is {self.speed_m_s}; use a least and a larger speed")
         if self.position_tolerance_mm is None:
@@ -181,9 +185,7 @@ class Track(Placing[TrackSpec, TrackScenario]):
         """Draw motions until one stays on the ring for the whole episode."""
         spec, random = self.spec, streams.generator("motion")
         fastest = random.uniform(*spec.speed_m_s)
-        times: FloatArray = spec.control_period_s * np.arange(
-            spec.time_limit_steps + 1, dtype=np.float64
-        )
+        times: FloatArray = _CHECK_PERIOD_S * np.arange(round(spec.motion_s / _CHECK_PERIOD_S) + 1)
         for _ in range(_MAX_REDRAWS):
             if spec.motion == "line":
                 motion = self._line(random, fastest)
@@ -193,8 +195,8 @@ class Track(Placing[TrackSpec, TrackScenario]):
             if spec.ring_m[0] <= radius.min() and radius.max() <= spec.ring_m[1]:
                 return motion
         raise OptionError(
-            f"no motion of {spec.time_limit_steps} steps at {fastest:.2f} m/s found that stays "
-            "on the ring; lower speed_m_s or time_limit_steps"
+            f"no motion of {spec.motion_s:g} s at {fastest:.2f} m/s found that stays on the ring; "
+            "lower speed_m_s or motion_s"
         )
 
     def _line(self, random: np.random.Generator, fastest: float) -> Motion:
@@ -308,6 +310,7 @@ register(
         target_diameter_m=0.020,
         tilt_tolerance_deg=0.5,
         time_limit_steps=80,
+        motion_s=8.0,
         latency_steps=1,
         **HARD,
     ),
