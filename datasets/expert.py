@@ -16,6 +16,7 @@ from hvs_suite.cell import robot
 from hvs_suite.datasets.planner import Planner
 from hvs_suite.errors import OptionError
 from hvs_suite.rollout import Observation
+from hvs_suite.tasks.shared.goal import Goal
 
 if TYPE_CHECKING:
     from hvs_suite.tasks.shared.environment import Environment
@@ -73,13 +74,14 @@ class Expert:
         self, q: FloatArray, velocity: FloatArray, set_point: FloatArray
     ) -> FloatArray:
         """Where the set point (7,) shall be at the end of the control step that acts next."""
-        env, delay_s = self._env, self._delay_s
-        goal = env.goal(delay_s)
+        goal = self._goal_in(0.0)
         if not goal.velocity.any():
             return self._planner.next_set_point(q, velocity, goal)
-        return self._planner.follow(
-            q, velocity, set_point, lambda ahead_s: env.goal(delay_s + ahead_s)
-        )
+        return self._planner.follow(q, velocity, set_point, self._goal_in)
+
+    def _goal_in(self, ahead_s: float) -> Goal:
+        """The goal some time (s) after the moment from which the action acts."""
+        return self._env.goal(self._delay_s + ahead_s)
 
 
 def make_expert(env: Environment) -> Expert:

@@ -8,7 +8,9 @@ camera's line of sight, to the same posture whatever it knows.
 Where the eye-to-hand camera stands a little elsewhere than it should, it says only within some
 centimetres where the target is. Who goes there at once ends up beside it, too low for the eye in
 the hand to see it. So until the eye in the hand has seen the target, the demonstrator heads for a
-place above it, from which it will.
+place above it, from which it will; above a target that moves, it moves along.
+
+A target that is suddenly elsewhere is a new one, of which nothing has been seen.
 
 And where the arm may start anywhere, it goes there in one of two plain postures (see
 `hvs_suite.datasets.planner.Planner`).
@@ -56,21 +58,28 @@ class Demonstrator(Expert):
 
     def reset(self) -> None:
         """Forget that the target was seen: a new episode begins."""
+        self._target: FloatArray | None = None
         self._has_seen = False
         self._has_seen_closely = not self._looks_down
 
     def _next_set_point(
         self, q: FloatArray, velocity: FloatArray, set_point: FloatArray
     ) -> FloatArray:
+        goal = self._env.goal()
+        if self._target is not None and not _is_same(self._target, goal):
+            self.reset()
+        self._target = goal.target
         if not (self._has_seen and self._has_seen_closely):
             self._look()
         if not self._has_seen:
             ahead = self._planner.towards_posture(q, velocity, LOOK_OUT_RAD)
             if ahead is not None:
                 return ahead
-        if not self._has_seen_closely:
-            return self._planner.next_set_point(q, velocity, _raised(self._env.goal()))
         return super()._next_set_point(q, velocity, set_point)
+
+    def _goal_in(self, ahead_s: float) -> Goal:
+        goal = super()._goal_in(ahead_s)
+        return goal if self._has_seen_closely else _raised(goal)
 
     def _look(self) -> None:
         """Notice whether a camera has the target in view."""
@@ -78,6 +87,14 @@ class Demonstrator(Expert):
         seen = {name: truth[f"{target}_{name}"][3] > 0.5 for name in CAMERA_NAMES}
         self._has_seen = self._has_seen or any(seen.values())
         self._has_seen_closely = self._has_seen_closely or bool(seen["eih"])
+
+
+def _is_same(target: FloatArray, goal: Goal) -> bool:
+    """Whether the target of a goal is the one that was at a place (3,) a control step ago.
+
+    One that moves may be anywhere near by; one that does not has to be there still.
+    """
+    return bool(goal.velocity.any() or (goal.target == target).all())
 
 
 def _raised(goal: Goal) -> Goal:

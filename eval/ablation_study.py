@@ -19,6 +19,7 @@ from hvs_suite.eval.comparison import Tally
 from hvs_suite.eval.result_file import Result
 from hvs_suite.eval.study_training import SPLIT, Report, earlier_result, train_and_judge
 from hvs_suite.policies.demonstrations import read_manifest
+from hvs_suite.registry import find
 
 WHOLE = "everything"
 NO_DAGGER = "no DAgger"
@@ -72,7 +73,7 @@ class Row(pydantic.BaseModel):
         n_only_this: Solved by this row alone.
         p: Of McNemar's exact test between them.
         steps_to_goal: Mean control steps to the goal; None if none was solved.
-        settled_position_error_mm: Interquartile mean where it settles (mm).
+        settled_error: Interquartile mean of the task's first headline metric where it settles.
         demonstrations: Episodes recorded for it.
         hours: Training time, rounds of DAgger not counted (h).
     """
@@ -87,7 +88,7 @@ class Row(pydantic.BaseModel):
     n_only_this: int
     p: float
     steps_to_goal: float | None
-    settled_position_error_mm: float
+    settled_error: float
     demonstrations: int
     hours: float
 
@@ -221,7 +222,7 @@ def _row(name: str, results: Mapping[str, Result], demonstrations: int, hours: f
         n_only_this=tally.n_only_b,
         p=tally.p,
         steps_to_goal=summary.steps_to_goal_mean,
-        settled_position_error_mm=summary.settled_position_error_mm.iqm,
+        settled_error=summary.settled.errors[find(summary.task).headline[0]].iqm,
         demonstrations=demonstrations,
         hours=hours,
     )
@@ -247,7 +248,7 @@ def markdown(study: Study) -> str:
             f"| {'nothing' if row.against is None else row.name} | {row.demonstrations:,} | "
             f"{row.n_success} of {row.n} ({100 * row.n_success / row.n:.1f} %) | "
             f"{row.ci95[0]:.1f} to {row.ci95[1]:.1f} % | {row.n_collision} | {steps} | "
-            f"{row.settled_position_error_mm:.2f} | {compared} |"
+            f"{row.settled_error:.2f} | {compared} |"
         )
     return "\n".join(lines) + "\n"
 

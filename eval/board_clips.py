@@ -86,13 +86,15 @@ def choose(result: Result) -> list[tuple[Kind, EpisodeRow]]:
     """Returns the typical success and the typical failure of a result, as far as it has them.
 
     Typical is the middle one: of successes by steps, of failures by where they ended. The best
-    would flatter, the worst would slander.
+    would flatter, the worst would slander. Clips are drawn from the action log, so it is the middle
+    one of the scenarios that it holds.
     """
-    rows = result.episodes
+    rows = result.episodes[: result.metadata.n_logged]
+    headline = registry.find(result.summary.task).headline[0]
     won = sorted((r for r in rows if r.success), key=lambda r: (r.steps, r.scenario))
     lost = sorted(
         (r for r in rows if not r.success),
-        key=lambda r: (r.settled_position_error_mm, r.scenario),
+        key=lambda r: (r.settled.errors[headline], r.scenario),
     )
     chosen: list[tuple[Kind, EpisodeRow]] = []
     if won:
@@ -166,7 +168,7 @@ def _draw(env: "Environment", order: _Order) -> None:
         frames.append(_frame(env))
         action = next(remaining, None)
         if action is None:
-            raise trial.EpisodeLostError(order.row.settled_failure or "the action log ends")
+            raise trial.EpisodeLostError(order.row.settled.failure or "the action log ends")
         return np.asarray(action)
 
     trial.play_trial(env, lambda: None, decide, order.row.scenario)
@@ -198,13 +200,13 @@ def _frame(env: "Environment") -> "Image":
         image = env.render(width=_CAMERA, height=_CAMERA, camera=camera)
         frame.paste(Image.fromarray(image), (SIZE[0] - _CAMERA, row * _CAMERA))
     info = env.info
+    shown = [metric for metric in env.spec.metrics if metric.name in env.spec.headline]
     figures = (
         f"{info['steps'] * env.spec.control_period_s:.1f} s",
-        f"{info['position_error_mm']:.2f} mm",
-        f"{info['tilt_error_deg']:.2f}°",
+        *(f"{info['errors'][metric.name]:.2f} {metric.unit}".rstrip() for metric in shown),
     )
     draw = ImageDraw.Draw(frame)
-    for text, right in zip(figures, (44, 180, 300), strict=True):
+    for text, right in zip(figures, (44, 180, 300), strict=False):
         # Flush right: digits that change stay in their places.
         draw.text((right, SIZE[1] - _STRIP + 3), text, _LIGHT, font(12), anchor="ra")
     return frame

@@ -2,8 +2,9 @@
 
 import base64
 import urllib.parse
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
+from hvs_suite import registry
 from hvs_suite.eval import board_clips, board_plots
 from hvs_suite.eval.board_clips import Clip
 from hvs_suite.eval.board_tables import (
@@ -15,15 +16,10 @@ from hvs_suite.eval.board_tables import (
     iqm_interval,
     joined,
 )
-from hvs_suite.eval.result_file import ERRORS, Metadata
+from hvs_suite.eval.result_file import Metadata
 from hvs_suite.names import shown
-
-TITLES: Mapping[str, str] = {
-    "position_error_mm": "position (mm)",
-    "lateral_error_mm": "sideways (mm)",
-    "height_error_mm": "height (mm)",
-    "tilt_error_deg": "tilt (deg)",
-}
+from hvs_suite.tasks.shared.goal import LATERAL, POSITION
+from hvs_suite.tasks.shared.metric import Metric
 
 
 def identity(entry: Entry) -> str:
@@ -49,7 +45,7 @@ def sheet(entry: Entry, clips: Sequence[Clip]) -> str:
 <small>{escaped(entry.task)}</small></h2>
 <form method="dialog"><button aria-label="Close">\N{MULTIPLICATION SIGN}</button></form></header>
 {_outcomes(entry)}
-{_films(clips)}
+{_films(entry, clips)}
 {_landings(entry)}
 {_errors(entry)}
 {_origin(entry)}
@@ -74,7 +70,7 @@ def _outcomes(entry: Entry) -> str:
     return _list(rows, "figures")
 
 
-def _films(clips: Sequence[Clip]) -> str:
+def _films(entry: Entry, clips: Sequence[Clip]) -> str:
     """Both clips; lazily, so that a closed sheet decodes nothing."""
     if not clips:
         return ""
@@ -84,14 +80,18 @@ def _films(clips: Sequence[Clip]) -> str:
         row = clip.row
         if row.success:
             how = f"solved in {row.steps} steps"
-        elif row.settled_failure is not None:
-            how = f"lost after {row.steps} steps: {row.settled_failure}"
+        elif row.settled.failure is not None:
+            how = f"lost after {row.steps} steps: {row.settled.failure}"
         elif row.collision:
             how = f"collides in step {row.steps}"
         else:
             how = "not solved in time"
-        where = f"{figure(row.settled_position_error_mm)} mm, {figure(row.settled_tilt_error_deg)}°"
-        caption = escaped(f"Scenario {row.scenario}: {how}; ends at {where}.")
+        where = ", ".join(
+            f"{metric.title} {figure(row.settled.errors[metric.name])} {metric.unit}".rstrip()
+            for metric in metrics_of(entry)
+            if metric.name in row.settled.errors
+        )
+        caption = escaped(f"Scenario {row.scenario}: {how}; at the end {where}.")
         data = base64.b64encode(clip.avif).decode("ascii")
         films.append(
             f'<figure><img loading="lazy" width="{width}" height="{height}" alt="{caption}" '
@@ -104,6 +104,8 @@ def _films(clips: Sequence[Clip]) -> str:
 def _landings(entry: Entry) -> str:
     rows = entry.result.episodes
     tolerance = sideways(entry)
+    if tolerance is None:
+        return ""
     radius = board_plots.landing_radius(rows)
     outside = sum(not board_plots.is_inside(row, radius) for row in rows)
     caption = "Where the flange stands around the target at the time limit, seen along the normal. "
@@ -122,25 +124,41 @@ def _landings(entry: Entry) -> str:
     )
 
 
-def sideways(entry: Entry) -> float:
-    """Returns the task's tolerance in the target plane (mm)."""
-    tolerances = entry.result.metadata.tolerances
-    return tolerances.get("lateral_error_mm", tolerances.get("position_error_mm", 0.0))
+def sideways(entry: Entry) -> float | None:
+    """Returns the task's tolerance in the target plane (mm); None where landings say nothing.
+
+    They do where episodes are played to their end whatever comes: past the goal to the time limit.
+    """
+    spec = registry.find(entry.result.summary.task)
+    if not spec.plays_on:
+        return None
+    return spec.step_bounds.get(LATERAL, spec.step_bounds.get(POSITION))
+
+
+def metrics_of(entry: Entry) -> list[Metric]:
+    """Returns the headline metrics of an entry's task."""
+    spec = registry.find(entry.result.summary.task)
+    metrics = {metric.name: metric for metric in spec.metrics}
+    return [metrics[name] for name in spec.headline]
+
+
+def _title(metric: Metric) -> str:
+    return f"{metric.title} ({metric.unit})" if metric.unit else metric.title
 
 
 def _errors(entry: Entry) -> str:
     """Settled errors, one row each."""
     summary = entry.result.summary
     rows = []
-    for name in ERRORS:
-        error = getattr(summary, f"settled_{name}")
-        sharpest = getattr(summary.settled_sharpest_95, name)
+    for metric in registry.find(summary.task).metrics:
+        error = summary.settled.errors[metric.name]
+        sharpest = summary.settled.sharpest_95.errors[metric.name]
         cells = (
             joined(figure(error.iqm), iqm_interval(error)),
             *(figure(value) for value in (error.p50, error.p95, error.p99, sharpest)),
         )
         rows.append(
-            f'<tr><th scope="row">{TITLES[name]}</th>'
+            f'<tr><th scope="row">{escaped(_title(metric))}</th>'
             + "".join(f"<td>{escaped(cell)}</td>" for cell in cells)
             + "</tr>"
         )

@@ -12,9 +12,9 @@ from markdown_it import MarkdownIt
 from hvs_suite.eval import board_entry, board_matrix, board_plots
 from hvs_suite.eval.board_clips import Clip
 from hvs_suite.eval.board_tables import (
-    COLUMNS,
     DASH,
     DRAFT,
+    MEANS,
     NOTE,
     SUCCESS,
     VERIFIED,
@@ -22,6 +22,7 @@ from hvs_suite.eval.board_tables import (
     Entry,
     Overall,
     by_task,
+    columns,
     describe,
     escaped,
     interval,
@@ -79,7 +80,7 @@ aria-label="Search policies" autocomplete="off"><nav aria-label="Tasks">{links}
 <p id="found" role="status"></p>
 <section id="all-tasks">
 <h2>All tasks</h2>
-<p>Mean success over all tasks; a task without a result counts as 0 %.</p>
+<p>{escaped(MEANS)}</p>
 {_overall(overall(entries), list(tables), colours)}
 <details class="note"><summary>What the figures mean</summary><p>{escaped(NOTE)}</p></details>
 </section>
@@ -100,7 +101,8 @@ aria-label="Search policies" autocomplete="off"><nav aria-label="Tasks">{links}
 def _overall(rows: Sequence[Overall], tasks: Sequence[str], colours: Mapping[str, int]) -> str:
     """Returns the table of policies against tasks."""
     head = _head(
-        [("policy", False), ("mean", True), *((task, True) for task in tasks)], sorted_by=1
+        [("policy", False), ("mean", True), ("families", True), *((task, True) for task in tasks)],
+        sorted_by=1,
     )
     body = []
     for row in rows:
@@ -108,7 +110,8 @@ def _overall(rows: Sequence[Overall], tasks: Sequence[str], colours: Mapping[str
         cells = [
             f'<td data-value="{row.mean!r}"><b>{percent(row.mean)}</b>'
             f"<small>{interval(row.low, row.high)}</small>"
-            f"{board_plots.bar(row.low, row.mean, row.high)}</td>"
+            f"{board_plots.bar(row.low, row.mean, row.high)}</td>",
+            f'<td data-value="{row.n_families}">{row.coverage}</td>',
         ]
         cells += [_overall_cell(row.entries.get(task)) for task in tasks]
         body.append(
@@ -132,16 +135,17 @@ def _overall_cell(entry: Entry | None) -> str:
 
 def _section(task: str, table: Sequence[Entry], colours: dict[str, int]) -> str:
     """Returns one task: table, curves, landings, comparison."""
+    summary = table[0].result.summary
+    shown = columns(summary.task)
     head = _head(
-        [("policy", False), *((column.title, column.larger_first) for column in COLUMNS)],
+        [("policy", False), *((column.title, column.larger_first) for column in shown)],
         sorted_by=1,
     )
     options = "".join(
         f'<option value="{index}"{" selected" if index == 1 else ""}>{escaped(title)}</option>'
-        for index, title in enumerate(("policy", *(column.title for column in COLUMNS)))
+        for index, title in enumerate(("policy", *(column.title for column in shown)))
     )
-    rows = "\n".join(_row(entry, colours[entry.policy]) for entry in table)
-    summary = table[0].result.summary
+    rows = "\n".join(_row(entry, shown, colours[entry.policy]) for entry in table)
     name = escaped(task)
     return f"""<section id="{name}">
 <h2>{name}</h2>
@@ -152,19 +156,34 @@ def _section(task: str, table: Sequence[Entry], colours: dict[str, int]) -> str:
 {rows}
 </tbody></table></div>
 <div class="plots">
-<figure>{board_plots.tolerance_plot(table, colours)}
-<figcaption>Success against tolerance, where the policy settles. 1 is the task's own tolerance;
-shaded, the pointwise 95 % intervals.</figcaption></figure>
+{_against_tolerance(table, colours)}
 <figure>{board_plots.steps_plot(table, colours)}
 <figcaption>Success against time: solved within so many control steps.</figcaption></figure>
 </div>
 {_legend(table, colours)}
-<h3>Where they land</h3>
-<p>Around the target at the time limit, in a picture of {2 * board_entry.sideways(table[0]):g} mm to
-each side; the circle is the tolerance.</p>
-<div class="landings">{"".join(_landing(entry) for entry in table)}</div>
+{_landings(table)}
 {_pairs(table)}
 </section>"""
+
+
+def _against_tolerance(table: Sequence[Entry], colours: dict[str, int]) -> str:
+    """Returns the curve of success against tolerance; nothing where a tolerance is 0."""
+    if table[0].result.summary.settled.success_by_scale is None:
+        return ""
+    return f"""<figure>{board_plots.tolerance_plot(table, colours)}
+<figcaption>Success against tolerance, where the episodes end. 1 is the task's own tolerance;
+shaded, the pointwise 95 % intervals.</figcaption></figure>"""
+
+
+def _landings(table: Sequence[Entry]) -> str:
+    """Returns where the policies of a task land; nothing where it goes on past its last goal."""
+    tolerance = board_entry.sideways(table[0])
+    if tolerance is None:
+        return ""
+    return f"""<h3>Where they land</h3>
+<p>Around the target at the end, in a picture of {2 * tolerance:g} mm to each side; the circle is
+the tolerance.</p>
+<div class="landings">{"".join(_landing(entry, tolerance) for entry in table)}</div>"""
 
 
 def _pairs(table: Sequence[Entry]) -> str:
@@ -185,9 +204,9 @@ def _head(columns: Sequence[tuple[str, bool]], sorted_by: int) -> str:
     )
 
 
-def _row(entry: Entry, colour: int) -> str:
+def _row(entry: Entry, shown: Sequence[Column], colour: int) -> str:
     name = escaped(entry.policy)
-    cells = "".join(_figure(column, entry) for column in COLUMNS)
+    cells = "".join(_figure(column, entry) for column in shown)
     return (
         f'<tr data-policy="{name}"><th scope="row" data-value="{name}">{_swatch(colour)}'
         f'<a href="{board_entry.link(entry)}">{name}</a></th>{cells}</tr>'
@@ -218,9 +237,8 @@ def _figure(column: Column, entry: Entry) -> str:
     )
 
 
-def _landing(entry: Entry) -> str:
+def _landing(entry: Entry, tolerance: float) -> str:
     rows = entry.result.episodes
-    tolerance = board_entry.sideways(entry)
     inside = sum(board_plots.is_inside(row, 2 * tolerance) for row in rows)
     plot = board_plots.landing_plot(
         rows, 2 * tolerance, tolerance, f"Landings of {entry.policy} around the target"

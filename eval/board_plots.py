@@ -112,7 +112,7 @@ def landing_plot(
         # Whole units, each once: a thousand episodes on one spot are one dot, and draw as one.
         spots = sorted(
             {
-                (round(half + row.settled_x_mm * unit), round(half - row.settled_y_mm * unit))
+                (round(half + row.settled.x_mm * unit), round(half - row.settled.y_mm * unit))
                 for row in rows
                 if _kind(row) == kind and is_inside(row, radius_mm)
             }
@@ -137,7 +137,7 @@ def landing_radius(rows: Sequence[EpisodeRow]) -> float:
 
 def is_inside(row: EpisodeRow, radius_mm: float) -> bool:
     """Whether a landing lies in a picture with this half side (mm)."""
-    return max(abs(row.settled_x_mm), abs(row.settled_y_mm)) <= radius_mm
+    return max(abs(row.settled.x_mm), abs(row.settled.y_mm)) <= radius_mm
 
 
 def figure_of(length_mm: float) -> str:
@@ -240,10 +240,10 @@ def _y(pc: float) -> float:
 
 
 def _kind(row: EpisodeRow) -> str:
-    if row.settled_lost:
+    if row.settled.lost:
         return "lost"
     return "hit" if row.success else "miss"
 
 
 def _distance(row: EpisodeRow) -> float:
-    return math.hypot(row.settled_x_mm, row.settled_y_mm)
+    return math.hypot(row.settled.x_mm, row.settled.y_mm)

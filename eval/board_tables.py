@@ -2,6 +2,7 @@
 
 import dataclasses
 import html
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 
 from hvs_suite import registry, statistics
@@ -91,57 +92,70 @@ SUCCESS = Column(
     interval=lambda e: interval(*e.result.summary.pc_success_ci95),
 )
 VERIFIED = Column("verified", lambda e: e.n_played, lambda e: e.proof, larger_first=True)
-COLUMNS = (
-    SUCCESS,
-    Column(
-        "collisions",
-        lambda e: share(e, e.result.summary.n_collision),
-        lambda e: percent(share(e, e.result.summary.n_collision)),
-    ),
-    Column(
-        "steps to goal",
-        lambda e: e.result.summary.steps_to_goal_mean,
-        lambda e: figure(e.result.summary.steps_to_goal_mean),
-    ),
-    Column(
-        "× expert's steps",
-        lambda e: e.steps_over_expert,
-        lambda e: figure(e.steps_over_expert),
-    ),
-    Column(
-        "settled position error (mm)",
-        lambda e: e.result.summary.settled_position_error_mm.iqm,
-        lambda e: figure(e.result.summary.settled_position_error_mm.iqm),
-        interval=lambda e: iqm_interval(e.result.summary.settled_position_error_mm),
-    ),
-    Column(
-        "p95 (mm)",
-        lambda e: e.result.summary.settled_position_error_mm.p95,
-        lambda e: figure(e.result.summary.settled_position_error_mm.p95),
-    ),
-    Column(
-        "settled tilt error (deg)",
-        lambda e: e.result.summary.settled_tilt_error_deg.iqm,
-        lambda e: figure(e.result.summary.settled_tilt_error_deg.iqm),
-        interval=lambda e: iqm_interval(e.result.summary.settled_tilt_error_deg),
-    ),
-    Column(
-        "p95 (deg)",
-        lambda e: e.result.summary.settled_tilt_error_deg.p95,
-        lambda e: figure(e.result.summary.settled_tilt_error_deg.p95),
-    ),
-    Column(
-        "sharpest tolerance (×)",
-        lambda e: e.result.summary.settled_sharpest_95.scale,
-        lambda e: figure(e.result.summary.settled_sharpest_95.scale),
-    ),
-    Column(
-        "ms per decision",
-        lambda e: e.result.timings.decision_ms,
-        lambda e: figure(e.result.timings.decision_ms),
-    ),
-    VERIFIED,
-)
+
+
+def columns(task: str) -> tuple[Column, ...]:
+    """Returns the columns of a task's table: what all tasks have, and its own headline metrics.
+
+    Args:
+        task: Its name, without version.
+    """
+    spec = registry.find(task)
+    titles = {metric.name: (metric.title, metric.unit) for metric in spec.metrics}
+    where = "settled " if spec.plays_on else ""
+    own: list[Column] = []
+    for name in spec.headline:
+        title, unit = titles[name]
+        own += [_middle(name, f"{where}{title}", unit), _tail(name, unit)]
+    return (
+        SUCCESS,
+        Column(
+            "collisions",
+            lambda e: share(e, e.result.summary.n_collision),
+            lambda e: percent(share(e, e.result.summary.n_collision)),
+        ),
+        Column(
+            "steps to goal",
+            lambda e: e.result.summary.steps_to_goal_mean,
+            lambda e: figure(e.result.summary.steps_to_goal_mean),
+        ),
+        Column(
+            "× expert's steps",
+            lambda e: e.steps_over_expert,
+            lambda e: figure(e.steps_over_expert),
+        ),
+        *own,
+        Column(
+            "sharpest tolerance (×)",
+            lambda e: e.result.summary.settled.sharpest_95.scale,
+            lambda e: figure(e.result.summary.settled.sharpest_95.scale),
+        ),
+        Column(
+            "ms per decision",
+            lambda e: e.result.timings.decision_ms,
+            lambda e: figure(e.result.timings.decision_ms),
+        ),
+        VERIFIED,
+    )
+
+
+def _middle(name: str, title: str, unit: str) -> Column:
+    """A metric's interquartile mean where the episodes ended."""
+    return Column(
+        f"{title} ({unit})" if unit else title,
+        lambda e: e.result.summary.settled.errors[name].iqm,
+        lambda e: figure(e.result.summary.settled.errors[name].iqm),
+        interval=lambda e: iqm_interval(e.result.summary.settled.errors[name]),
+    )
+
+
+def _tail(name: str, unit: str) -> Column:
+    """A metric's 95th percentile there."""
+    return Column(
+        f"p95 ({unit})" if unit else "p95",
+        lambda e: e.result.summary.settled.errors[name].p95,
+        lambda e: figure(e.result.summary.settled.errors[name].p95),
+    )
 
 
 def make_entries(
@@ -180,7 +194,7 @@ def make_entries(
 def by_task(entries: Sequence[Entry]) -> dict[str, list[Entry]]:
     """Returns the entries of each task, easiest task first, best entry first.
 
-    Equal success is decided by the settled position error, then by name.
+    Equal success is decided by the task's first headline metric, then by name.
     """
     tables: dict[str, list[Entry]] = {}
     names = list(TASKS)
@@ -190,11 +204,15 @@ def by_task(entries: Sequence[Entry]) -> dict[str, list[Entry]]:
         table.sort(
             key=lambda e: (
                 -e.result.summary.pc_success,
-                e.result.summary.settled_position_error_mm.iqm,
+                e.result.summary.settled.errors[_first_metric(e)].iqm,
                 e.policy,
             )
         )
     return tables
+
+
+def _first_metric(entry: Entry) -> str:
+    return registry.find(entry.result.summary.task).headline[0]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -204,10 +222,13 @@ class Overall:
     Attributes:
         policy: Name on the board.
         entries: Its entries by task.
-        mean: Mean success over all tasks of the board (percent); a task it was not scored on
-            counts as 0 %, so that leaving out the hard ones does not lift it.
+        mean: Mean success (percent), over the families that it was scored on, of each family's
+            mean. A task of such a family that it was not scored on counts as 0 %, so that leaving
+            out the hard ones does not lift it.
         low: Lower end of the mean's 95 % interval (percent).
         high: Upper end.
+        n_families: Families that it was scored on.
+        of_families: Families on the board.
     """
 
     policy: str
@@ -215,23 +236,44 @@ class Overall:
     mean: float
     low: float
     high: float
+    n_families: int
+    of_families: int
+
+    @property
+    def coverage(self) -> str:
+        """How much of the board it was scored on."""
+        return f"{self.n_families} of {self.of_families}"
 
 
 def overall(entries: Sequence[Entry]) -> list[Overall]:
-    """Returns each policy over all tasks, the best mean first; ties go by name."""
+    """Returns each policy over all tasks: more families first, then the better mean, then by name.
+
+    Args:
+        entries: Of the whole board.
+    """
     rows: dict[str, dict[str, Entry]] = {}
     for entry in sorted(entries, key=lambda e: (e.policy, e.task)):
         rows.setdefault(entry.policy, {})[entry.task] = entry
-    n_tasks = len({entry.task for entry in entries})
+    family = {entry.task: registry.find(entry.result.summary.task).family for entry in entries}
+    size = Counter(family.values())
     table = []
     for policy, row in rows.items():
+        scored = {family[task] for task in row}
+        weights = [1.0 / (size[family[task]] * len(scored)) for task in row]
         summaries = [entry.result.summary for entry in row.values()]
-        low, high = statistics.mean_rate_interval([(s.n_success, s.n_episodes) for s in summaries])
-        mean = sum(s.pc_success for s in summaries) / n_tasks
-        # What is missing is 0 % for certain: it lowers mean and interval alike.
-        scored = len(summaries) / n_tasks
-        table.append(Overall(policy, row, mean, low * scored, high * scored))
-    return sorted(table, key=lambda row: (-row.mean, row.policy))
+        low, high = statistics.mean_rate_interval(
+            [(s.n_success, s.n_episodes) for s in summaries], weights=weights
+        )
+        mean = sum(w * s.pc_success for w, s in zip(weights, summaries, strict=True))
+        table.append(Overall(policy, row, mean, low, high, len(scored), len(size)))
+    return sorted(table, key=lambda row: (-row.n_families, -row.mean, row.policy))
+
+
+MEANS = (
+    "Mean success: first over the tasks of a family, where one without a result counts as 0 %, "
+    "then over the families that a policy was scored on. Policies that were scored on more "
+    "families come first."
+)
 
 
 def describe(task: str) -> str:
@@ -263,15 +305,16 @@ def markdown(entries: Sequence[Entry], *, draft: bool = False) -> str:
         "",
         "## All tasks",
         "",
-        "Mean success over all tasks; a task without a result counts as 0 %.",
+        MEANS,
         "",
     ]
     lines += _table(
-        ["policy", "mean", *tables],
+        ["policy", "mean", "families", *tables],
         [
             [
                 row.policy,
                 joined(percent(row.mean), interval(row.low, row.high)),
+                row.coverage,
                 *(_cell(row.entries.get(task)) for task in tables),
             ]
             for row in overall(entries)
@@ -282,8 +325,11 @@ def markdown(entries: Sequence[Entry], *, draft: bool = False) -> str:
         lines += ["", f"## {task}", "", describe(summary.task)]
         lines += [f"Split `{_plain(summary.split)}`.", ""]
         lines += _table(
-            ["policy", *(column.title for column in COLUMNS)],
-            [[e.policy, *(joined(c.text(e), c.interval(e)) for c in COLUMNS)] for e in table],
+            ["policy", *(column.title for column in columns(summary.task))],
+            [
+                [e.policy, *(joined(c.text(e), c.interval(e)) for c in columns(summary.task))]
+                for e in table
+            ],
         )
     lines += ["", "Written by `hvs leaderboard` from the result files; do not edit.", ""]
     return "\n".join(lines)
@@ -329,11 +375,12 @@ def figure(value: float | None) -> str:
 
 
 def _steps_over(result: Result, expert: Result) -> float | None:
-    theirs = {row.scenario: row.steps for row in expert.episodes if row.success}
-    both = [row for row in result.episodes if row.success and row.scenario in theirs]
-    if not both:
-        return None
-    return sum(row.steps for row in both) / sum(theirs[row.scenario] for row in both)
+    pairs = [
+        (own.steps_to_goal, theirs.steps_to_goal)
+        for own, theirs in zip(result.episodes, expert.episodes, strict=False)
+        if own.steps_to_goal is not None and theirs.steps_to_goal is not None
+    ]
+    return sum(own for own, _ in pairs) / sum(steps for _, steps in pairs) if pairs else None
 
 
 def escaped(text: str) -> str:

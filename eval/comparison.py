@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 
-from hvs_suite import reading, statistics
+from hvs_suite import reading, registry, statistics
 from hvs_suite.errors import ResultError
 from hvs_suite.eval import lerobot_import, result_file
 from hvs_suite.eval.result_file import EpisodeRow
@@ -49,9 +49,8 @@ class Comparison:
         n_neither: Solved by neither.
         p: Two-sided p-value of McNemar's exact test.
         success: Success rate, A minus B (percentage points).
-        settled_position_mm: Settled position error, A minus B (mm); None for imported
-            results.
-        settled_tilt_deg: Settled tilt error, A minus B (deg); None for imported results.
+        settled: The task's headline metrics where the episodes ended, A minus B, by name; empty for
+            imported results.
         steps_to_goal: Steps to goal, A minus B, over scenarios that both solved (control steps).
         unverified: Names of policies whose result is an import.
     """
@@ -66,8 +65,7 @@ class Comparison:
     n_neither: int
     p: float
     success: Difference
-    settled_position_mm: Difference | None
-    settled_tilt_deg: Difference | None
+    settled: dict[str, Difference]
     steps_to_goal: Difference | None
     unverified: tuple[str, ...]
 
@@ -167,7 +165,11 @@ def compare(first: Path, second: Path) -> Comparison:
         raise ResultError(f"{first} and {second} have no scenario in common")
     tally = Tally.of(a.success, b.success)
     rows = [(a.rows[i], b.rows[i]) for i in common if i in a.rows and i in b.rows]
-    steps = [(ours.steps, theirs.steps) for ours, theirs in rows if ours.success and theirs.success]
+    steps = [
+        (ours.steps_to_goal, theirs.steps_to_goal)
+        for ours, theirs in rows
+        if ours.steps_to_goal is not None and theirs.steps_to_goal is not None
+    ]
     names = (a.name, b.name) if a.name != b.name else (f"{a.name} (A)", f"{b.name} (B)")
     return Comparison(
         task=a.task,
@@ -180,8 +182,14 @@ def compare(first: Path, second: Path) -> Comparison:
             [100.0 * a.success[index] for index in common],
             [100.0 * b.success[index] for index in common],
         ),
-        settled_position_mm=_difference(rows, "settled_position_error_mm"),
-        settled_tilt_deg=_difference(rows, "settled_tilt_error_deg"),
+        settled={
+            name: statistics.paired_difference(
+                [ours.settled.errors[name] for ours, _ in rows],
+                [theirs.settled.errors[name] for _, theirs in rows],
+            )
+            for name in registry.find(a.task).headline
+            if rows and all(name in row.errors for row in rows[0])
+        },
         steps_to_goal=(
             statistics.paired_difference(
                 [ours for ours, _ in steps], [theirs for _, theirs in steps]
@@ -220,13 +228,4 @@ def load_side(path: Path) -> Side:
         digest=result.metadata.task_digest,
         success={row.scenario: row.success for row in result.episodes},
         rows={row.scenario: row for row in result.episodes},
-    )
-
-
-def _difference(rows: list[tuple[EpisodeRow, EpisodeRow]], name: str) -> Difference | None:
-    if not rows:
-        return None
-    ours, theirs = zip(*rows, strict=True)
-    return statistics.paired_difference(
-        [getattr(row, name) for row in ours], [getattr(row, name) for row in theirs]
     )

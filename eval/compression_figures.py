@@ -70,9 +70,8 @@ class Success(_Block):
         n_only_lossless: Solved only by the policy that learned from lossless pictures.
         n_only_this: Solved only by this one.
         p: Two-sided p-value of McNemar's exact test against the lossless one.
-        position_error_mm: Mean over all episodes, at their end (mm).
-        tilt_error_deg: Mean over all episodes, at their end (deg).
-        settled_position_error_mm: Interquartile mean at the time limit (mm).
+        errors: Mean of each metric over all episodes, where they were scored.
+        settled_error: Interquartile mean of the task's first headline metric at the time limit.
     """
 
     n: int
@@ -81,9 +80,8 @@ class Success(_Block):
     n_only_lossless: int
     n_only_this: int
     p: float
-    position_error_mm: float
-    tilt_error_deg: float
-    settled_position_error_mm: float
+    errors: dict[str, float]
+    settled_error: float
 
 
 class Row(_Block):

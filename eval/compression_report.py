@@ -121,14 +121,14 @@ def _draw_success(above: Any, below: Any, study: Study) -> None:
         for size, (_, own) in zip(sizes, done, strict=True):
             above.plot((size, size), own.pc_success_ci95, color=COLOURS.get(name, INK), linewidth=1)
         _line(above, name, [row for row, _ in done], sizes, rates)
-        errors = [each.settled_position_error_mm for _, each in done]
+        errors = [each.settled_error for _, each in done]
         _line(below, name, [row for row, _ in done], sizes, errors)
     lossless = study.rows[0]
     if lossless.success is not None:
         rate = 100.0 * lossless.success.n_success / lossless.success.n
         above.axhspan(*lossless.success.pc_success_ci95, color=RULE, alpha=0.5, linewidth=0)
         _rule(above, rate, lossless.megabytes)
-        _rule(below, lossless.success.settled_position_error_mm, lossless.megabytes)
+        _rule(below, lossless.success.settled_error, lossless.megabytes)
     _logarithmic(below.yaxis)
     _title(above, f"policy, {study.steps:,} training steps")
     above.set_ylabel("solved, with 95 % interval (%)", fontsize=9, color=FAINT)
@@ -233,6 +233,6 @@ def _success(row: Row) -> tuple[str, ...]:
         f"{low:.1f} to {high:.1f}",
         f"{own.n_only_lossless}, {own.n_only_this}",
         f"{own.p:.2g}",
-        f"{own.position_error_mm:.2f}, {own.tilt_error_deg:.2f}",
-        f"{own.settled_position_error_mm:.3f}",
+        ", ".join(f"{value:.2f}" for value in own.errors.values()),
+        f"{own.settled_error:.3f}",
     )

@@ -39,6 +39,7 @@ from hvs_suite.eval.study_training import Report, earlier_result, train_and_judg
 from hvs_suite.files import check_writable, replacing
 from hvs_suite.policies.demonstrations import read_manifest, refuse_test_split
 from hvs_suite.policies.frame_cache import fingerprint
+from hvs_suite.registry import find
 
 LOSSLESS = "PNG"
 CODECS = {"av1": ("libsvtav1", "AV1", 63), "h264": ("h264", "H.264", 51)}
@@ -298,9 +299,11 @@ def _outcomes(
                 n_only_lossless=tally.n_only_a,
                 n_only_this=tally.n_only_b,
                 p=tally.p,
-                position_error_mm=_mean([row.position_error_mm for row in result.episodes]),
-                tilt_error_deg=_mean([row.tilt_error_deg for row in result.episodes]),
-                settled_position_error_mm=summary.settled_position_error_mm.iqm,
+                errors={
+                    name: _mean([row.errors[name] for row in result.episodes])
+                    for name in find(summary.task).headline
+                },
+                settled_error=summary.settled.errors[find(summary.task).headline[0]].iqm,
             )
         )
     return successes

@@ -9,7 +9,7 @@ import dataclasses
 import enum
 import statistics
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,10 +19,12 @@ import torch
 from hvs_suite import registry
 from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.errors import ResultError
-from hvs_suite.eval import action_log, result_file
+from hvs_suite.eval import result_file, verification
 from hvs_suite.eval.result_file import EpisodeRow
+from hvs_suite.eval.trial import play_trial
 from hvs_suite.names import shown
-from hvs_suite.policies.checkpoint import load_network, network_inputs, read_config
+from hvs_suite.policies.checkpoint import load_network, network_inputs
+from hvs_suite.policies.checkpoint_files import read_config
 from hvs_suite.rollout import Action, Observation, one_torch_thread
 from hvs_suite.tasks.shared.spec import Spec
 
@@ -54,8 +56,7 @@ class Failure:
         scenario: Its index.
         cause: Why it was lost.
         steps: Control steps played.
-        position_error_mm: At the end (mm).
-        tilt_error_deg: At the end (deg).
+        errors: The task's metrics at the end.
         seen_steps: Decisions at which a camera had the target in view.
         estimate_error_mm: How far off sideways the policy took the target to be at its last
             decision (mm), as seen from the flange: where the joints measure wrongly it need not
@@ -66,8 +67,7 @@ class Failure:
     scenario: int
     cause: Cause
     steps: int
-    position_error_mm: float
-    tilt_error_deg: float
+    errors: Mapping[str, float]
     seen_steps: int
     estimate_error_mm: float | None
     target_radius_m: float
@@ -135,15 +135,23 @@ def sort_failures(
         PolicyError: The checkpoint is not of an `hvs` policy, or cannot be loaded.
     """
     result = result_file.load(path)
-    log = action_log.load(result_file.actions_path(path), result.metadata.actions_sha256)
+    log = verification.load_actions(path, result)
     network = None
     if checkpoint is not None:
         network = load_network(checkpoint, read_config(checkpoint))
     failures = []
     with contextlib.closing(registry.load(result.summary.task, split=result.summary.split)) as env:
-        for row, actions in zip(result.episodes, log, strict=True):
+        unlogged = None
+        if result.metadata.n_logged < len(result.episodes):
+            unlogged = verification.builtin_policy(path, result)(env)
+        for row in result.episodes:
             if row.success:
                 continue
+            if row.scenario < len(log):
+                actions = log[row.scenario]
+            else:
+                assert unlogged is not None
+                _, actions = play_trial(env, unlogged.reset, unlogged.select_action, row.scenario)
             failures.append(_sort(env, row, list(actions[: row.steps]), network))
             if progress is not None:
                 progress()
@@ -160,7 +168,7 @@ def _sort(
     memory: Any = None
     off_mm: float | None = None
     seen = 0
-    errors_mm = [float(env.info["position_error_mm"])]
+    distances_m = [env.distance_m]
     spec = env.action_spec()
     for action in actions:
         if time_step.last():
@@ -178,13 +186,12 @@ def _sort(
                 believed = (decision.target - decision.motion.position)[0].double().numpy()
                 off_mm = 1e3 * float(np.linalg.norm((believed - (target - flange))[:2]))
         time_step = env.step(executed)
-        errors_mm.append(float(env.info["position_error_mm"]))
+        distances_m.append(env.distance_m)
     return Failure(
         scenario=row.scenario,
-        cause=cause_of(row, env.spec, seen, off_mm, errors_mm),
+        cause=cause_of(row, env.spec, seen, off_mm, distances_m),
         steps=row.steps,
-        position_error_mm=row.position_error_mm,
-        tilt_error_deg=row.tilt_error_deg,
+        errors=row.errors,
         seen_steps=seen,
         estimate_error_mm=off_mm,
         target_radius_m=float(np.hypot(target[0], target[1])),
@@ -196,7 +203,7 @@ def cause_of(
     spec: Spec,
     seen_steps: int,
     estimate_error_mm: float | None,
-    errors_mm: Sequence[float],
+    distances_m: Sequence[float],
 ) -> Cause:
     """Why a scenario was lost.
 
@@ -205,21 +212,17 @@ def cause_of(
         spec: The task's parameters.
         seen_steps: As in `Failure`.
         estimate_error_mm: As in `Failure`.
-        errors_mm: Position error at the start and after every step (mm).
+        distances_m: Distance to the goal at the start and after every step (m).
     """
-    bounds = spec.tolerances
-    tolerance_mm = next(
-        bounds[name] for name in ("position_error_mm", "lateral_error_mm") if name in bounds
-    )
     if row.failure is not None:
         return Cause.BROKEN
     if row.collision:
         return Cause.COLLIDED
     if not seen_steps:
         return Cause.NOT_SEEN
-    if estimate_error_mm is not None and estimate_error_mm > tolerance_mm:
+    if estimate_error_mm is not None and estimate_error_mm > spec.tightest_tolerance_mm:
         return Cause.MISPLACED
-    if errors_mm[-1] < _FALLING * errors_mm[-1 - min(_LAST_STEPS, len(errors_mm) - 1)]:
+    if distances_m[-1] < _FALLING * distances_m[-1 - min(_LAST_STEPS, len(distances_m) - 1)]:
         return Cause.SLOW
     return Cause.CONTROLLED
 
@@ -240,8 +243,9 @@ def markdown(reports: Sequence[Report]) -> str:
         ]
         if not report.failures:
             continue
+        headline = registry.find(report.task).headline[0]
         lines += [
-            "| cause | lost | share | median error, mm | median error of the estimate, mm "
+            f"| cause | lost | share | median {headline} | median error of the estimate, mm "
             "| median radius of the target, m | scenarios |",
             "|---|---|---|---|---|---|---|",
         ]
@@ -253,7 +257,7 @@ def markdown(reports: Sequence[Report]) -> str:
             scenarios = ", ".join(str(failure.scenario) for failure in found[:8])
             lines.append(
                 f"| {cause} | {len(found)} | {100 * len(found) / report.n_episodes:.1f} % | "
-                f"{statistics.median(f.position_error_mm for f in found):.2f} | "
+                f"{statistics.median(f.errors[headline] for f in found):.2f} | "
                 f"{f'{statistics.median(off):.2f}' if off else '-'} | "
                 f"{statistics.median(f.target_radius_m for f in found):.2f} | "
                 f"{scenarios}{', ...' if len(found) > 8 else ''} |"

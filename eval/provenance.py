@@ -3,12 +3,18 @@
 import dataclasses
 import hashlib
 import importlib.metadata
-import json
 import math
+import os
 import platform
 from pathlib import Path
+from typing import Annotated
+
+import pydantic
 
 from hvs_suite.cell import gl
+from hvs_suite.errors import PolicyError
+from hvs_suite.policies.checkpoint_files import MOST_SETTINGS_BYTES, home, read_shapes
+from hvs_suite.reading import read_bytes
 
 # Whatever can change a physics state, a picture, or a policy's answer to it.
 PACKAGES = (
@@ -22,6 +28,8 @@ PACKAGES = (
     "lerobot",
 )
 CHECKPOINT_SUFFIXES = (".json", ".safetensors")
+# JSON readers elsewhere keep whole numbers up to here.
+_MOST_STEPS = 2**53
 
 
 def suite_version() -> str:
@@ -94,17 +102,25 @@ def file_hash(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def parameters(folder: Path) -> int | None:
-    """Returns how many numbers a checkpoint's ``model.safetensors`` holds; None without one."""
-    try:
-        with (folder / "model.safetensors").open("rb") as file:
-            # The format's own header: eight bytes of length, then JSON with every tensor's shape.
-            header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
-        return sum(
-            math.prod(tensor["shape"]) for name, tensor in header.items() if name != "__metadata__"
-        )
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+def parameters(folder: Path) -> int:
+    """Returns how many numbers a checkpoint's ``model.safetensors`` holds.
+
+    Args:
+        folder: The checkpoint.
+
+    Raises:
+        PolicyError: The file is missing or damaged.
+    """
+    return sum(math.prod(shape) for shape in read_shapes(folder).values())
+
+
+class _Outcome(pydantic.BaseModel):
+    step: Annotated[int, pydantic.Field(strict=True, ge=0, le=_MOST_STEPS)]
+    train_s: Annotated[float, pydantic.Field(ge=0.0, allow_inf_nan=False)]
+
+
+class _TrainingStep(pydantic.BaseModel):
+    step: Annotated[int, pydantic.Field(strict=True, ge=0, le=_MOST_STEPS)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,14 +140,35 @@ def training(folder: Path) -> Training:
     """Reads ``training/outcome.json``, which our training commands leave in a checkpoint.
 
     ``lerobot-train`` keeps its steps beside the checkpoint, and no hours.
+
+    Args:
+        folder: The checkpoint.
+
+    Raises:
+        PolicyError: There is such a file, but damaged: numbers missing, negative or not finite. A
+            result that says so would be refused once everything was played.
     """
+    outcome = _read(_Outcome, folder, "training/outcome.json")
+    if outcome is not None:
+        return Training(outcome.step, outcome.train_s / 3600.0)
+    state = _read(_TrainingStep, folder.parent, "training_state/training_step.json")
+    return Training(None if state is None else state.step, None)
+
+
+def _read[Model: pydantic.BaseModel](model: type[Model], folder: Path, name: str) -> Model | None:
+    """A file of a folder, of which a model says what matters; None if there is none."""
+    path = folder / name
+    if not os.path.lexists(path):
+        return None
+    content = read_bytes(
+        path, most=MOST_SETTINGS_BYTES, error=PolicyError, within=home(folder, name)
+    )
     try:
-        outcome = json.loads((folder / "training" / "outcome.json").read_bytes())
-        return Training(int(outcome["step"]), float(outcome["train_s"]) / 3600.0)
-    except (OSError, ValueError, KeyError, TypeError):
-        pass
-    try:
-        state = json.loads((folder.parent / "training_state" / "training_step.json").read_bytes())
-        return Training(int(state["step"]), None)
-    except (OSError, ValueError, KeyError, TypeError):
-        return Training(None, None)
+        # Pydantic's own parser takes NaN, which stands for a loss that was not measured.
+        return model.model_validate_json(content)
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise PolicyError(
+            f"{path}: {where + ': ' if where else ''}{first['msg']}; mend or remove the file"
+        ) from error

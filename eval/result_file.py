@@ -2,8 +2,8 @@
 
 The file is JSON with five blocks: ``schema_version`` and ``sha256``, ``summary`` (computed from the
 rows), ``metadata`` (what was run, on what), ``timings`` (the only block that differs between two
-runs of the same thing) and ``episodes``, one row a line, so that two files can be compared line by
-line. ``docs/results.md`` explains every key.
+runs of the same thing) and ``episodes``, one column a line, so that two files can be compared line
+by line. ``docs/results.md`` explains every key.
 """
 
 import hashlib
@@ -19,19 +19,22 @@ import pydantic
 from hvs_suite import files, reading, statistics
 from hvs_suite.errors import ResultError
 
-SCHEMA_VERSION: Final = 2
-ERRORS = ("position_error_mm", "lateral_error_mm", "height_error_mm", "tilt_error_deg")
+SCHEMA_VERSION: Final = 3
 SCALES = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 20.0, 50.0, 100.0)
 """Where the curve of success against tolerance is given, in multiples of the task's tolerances."""
 SHARPEST_PERCENT = 95.0
 MOST_BYTES = 16 * 2**20
-"""Largest file that is read: twenty-five times one of 1,000 scenarios."""
+"""Largest file that is read: a hundred times one of 1,000 scenarios."""
+MOST_EPISODES = 100_000
+MOST_COLUMNS = 100
+"""Columns that are read: three times those of any task. Each becomes a value of every row."""
 
 Count = Annotated[int, pydantic.Field(ge=0)]
 Error = Annotated[float, pydantic.Field(ge=0.0, allow_inf_nan=False)]
 Signed = Annotated[float, pydantic.Field(allow_inf_nan=False)]
 Percent = Annotated[float, pydantic.Field(ge=0.0, le=100.0)]
 Seconds = Annotated[float, pydantic.Field(ge=0.0, allow_inf_nan=False)]
+Errors = dict[str, Error]
 Interval = Annotated[list[float], pydantic.Field(min_length=2, max_length=2)]
 
 
@@ -41,36 +44,51 @@ class _Block(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
+class Settled(_Block):
+    """Where a scenario ended that was played on past its goal to the time limit.
+
+    Attributes:
+        steps: Control steps played altogether.
+        collision: A forbidden contact ended them.
+        failure: As in `EpisodeRow`, after the goal too.
+        errors: The task's metrics at the end of the last of them.
+        x_mm: Where the flange stands then in the target plane, along the base's x axis.
+        y_mm: The same across it.
+    """
+
+    steps: Count
+    collision: bool
+    failure: str | None
+    errors: Errors
+    x_mm: Signed
+    y_mm: Signed
+
+    @property
+    def lost(self) -> bool:
+        """Whether the arm did not stand anywhere at the end: it collided or was lost."""
+        return self.collision or self.failure is not None
+
+
 class EpisodeRow(_Block):
     """One scenario's outcome.
 
-    The policy plays on past the goal to the time limit: what happened up to the goal is the score,
-    where the flange then stands are the ``settled`` figures. Without success the two are the same.
+    What happened up to the goal is the score. Where the task goes on past its goal, the policy
+    plays to the time limit, and ``settled`` says where it then stands; elsewhere, and without
+    success, the two are the same.
 
     Attributes:
         scenario: Index in the split.
-        success: The goal was held for the task's number of control steps.
+        success: The task was done, as its family judges it.
         success_once: Within tolerance at the end of at least one control step up to ``steps``.
         collision: A forbidden contact came before the goal.
         truncated: The time limit came before the goal.
         steps: Control steps up to success, collision, time limit or failure.
-        steps_to_goal: The same for a success; None otherwise.
+        steps_to_goal: Control steps to the goal, at most ``steps``; None without success.
         n_clipped: Those of these steps whose action was out of range.
-        position_error_mm: Norm of lateral and height error after ``steps``.
-        lateral_error_mm: In the target plane.
-        height_error_mm: Along the surface normal.
-        tilt_error_deg: Between flange axis and inward surface normal.
         failure: Why the policy lost the episode before the goal: ``not finite``, ``wrong shape``,
-            ``too slow``, ``process ended`` or ``raised <error>``; None if it did not.
-        settled_steps: Control steps played altogether.
-        settled_collision: A forbidden contact ended them.
-        settled_failure: As ``failure``, after the goal too.
-        settled_position_error_mm: Error at the end of the last of them; likewise the three below.
-        settled_lateral_error_mm: In the target plane.
-        settled_height_error_mm: Along the surface normal.
-        settled_tilt_error_deg: Between flange axis and inward surface normal.
-        settled_x_mm: Where the flange stands then in the target plane, along the base's x axis.
-        settled_y_mm: The same across it.
+            ``too slow``, or ``raised <error>``; None if it did not.
+        errors: The task's metrics after ``steps``, by name.
+        settled: Where it ended.
     """
 
     scenario: Count
@@ -81,44 +99,30 @@ class EpisodeRow(_Block):
     steps: Count
     steps_to_goal: int | None
     n_clipped: Count
-    position_error_mm: Error
-    lateral_error_mm: Error
-    height_error_mm: Error
-    tilt_error_deg: Error
     failure: str | None
-    settled_steps: Count
-    settled_collision: bool
-    settled_failure: str | None
-    settled_position_error_mm: Error
-    settled_lateral_error_mm: Error
-    settled_height_error_mm: Error
-    settled_tilt_error_deg: Error
-    settled_x_mm: Signed
-    settled_y_mm: Signed
-
-    @property
-    def settled_lost(self) -> bool:
-        """Whether the arm did not stand anywhere at the time limit: it collided or was lost."""
-        return self.settled_collision or self.settled_failure is not None
+    errors: Errors
+    settled: Settled
 
     def scale(self, tolerances: Mapping[str, float]) -> float:
         """Factor on all of a task's tolerances that this row's settled errors just meet.
 
         Args:
-            tolerances: Bound of each error that the task bounds (mm, deg).
+            tolerances: Bound of each metric that decides success, none of them 0.
 
         Returns:
             The largest quotient of error and bound; infinity where the arm was lost.
         """
-        if self.settled_lost:
+        if self.settled.lost:
             return math.inf
-        return max(getattr(self, f"settled_{name}") / bound for name, bound in tolerances.items())
+        return max(self.settled.errors[name] / bound for name, bound in tolerances.items())
 
     @pydantic.model_validator(mode="after")
     def _agree(self) -> Self:
         """Refuses an outcome that no episode can have."""
-        if self.steps_to_goal != (self.steps if self.success else None):
-            raise ValueError("steps_to_goal must equal steps for a success and be null otherwise")
+        if (self.steps_to_goal is not None) != self.success:
+            raise ValueError("steps_to_goal is a number for a success and null otherwise")
+        if self.steps_to_goal is not None and not 0 < self.steps_to_goal <= self.steps:
+            raise ValueError("steps_to_goal must lie between 1 and steps")
         if self.success + self.collision + self.truncated + (self.failure is not None) != 1:
             raise ValueError(
                 "an episode has one end: success, collision, truncated or a failure's reason"
@@ -127,13 +131,14 @@ class EpisodeRow(_Block):
             raise ValueError("a success must also count as success_once")
         if self.n_clipped > self.steps:
             raise ValueError("n_clipped cannot exceed steps")
-        if self.settled_steps < self.steps:
-            raise ValueError("settled_steps cannot be fewer than steps")
+        end = self.settled
+        if end.steps < self.steps:
+            raise ValueError("settled.steps cannot be fewer than steps")
+        if end.errors.keys() != self.errors.keys():
+            raise ValueError("settled.errors must have the metrics of errors")
         if not self.success:
-            ours = (self.steps, self.collision, self.failure)
-            if ours != (self.settled_steps, self.settled_collision, self.settled_failure) or any(
-                getattr(self, name) != getattr(self, f"settled_{name}") for name in ERRORS
-            ):
+            ours = (self.steps, self.collision, self.failure, self.errors)
+            if ours != (end.steps, end.collision, end.failure, end.errors):
                 raise ValueError("without success, the settled figures must be the episode's own")
         return self
 
@@ -206,18 +211,55 @@ class Sharpest(_Block):
     """The sharpest tolerance that 95 % of the episodes met where they settled; None if none is.
 
     Attributes:
-        scale: Multiple of all the task's tolerances at once.
-        position_error_mm: Bound on each error alone; likewise the three below.
-        lateral_error_mm: In the target plane.
-        height_error_mm: Along the surface normal.
-        tilt_error_deg: Between flange axis and inward surface normal.
+        scale: Multiple of all the task's tolerances at once; None also where one of them is 0.
+        errors: Bound on each metric alone.
     """
 
     scale: Error | None
-    position_error_mm: Error | None
-    lateral_error_mm: Error | None
-    height_error_mm: Error | None
-    tilt_error_deg: Error | None
+    errors: dict[str, Error | None]
+
+
+class SettledSummary(_Block):
+    """Where the episodes ended, those that were lost counting where they stopped.
+
+    Attributes:
+        n_lost: Episodes that ended in a collision or a failure, before or after the goal.
+        errors: Each metric.
+        success_by_scale: Success against tolerance, lost episodes never a success; None where a
+            tolerance is 0.
+        sharpest_95: The sharpest tolerance met in 95 % of the scenarios.
+    """
+
+    n_lost: Count
+    errors: dict[str, SettledErrorSummary]
+    success_by_scale: ToleranceCurve | None
+    sharpest_95: Sharpest
+
+    @classmethod
+    def of(cls, rows: Sequence[EpisodeRow], tolerances: Mapping[str, float]) -> Self:
+        """Returns the summary of one or more rows."""
+        ends = [row.settled for row in rows]
+        curve, scale = None, None
+        if all(bound > 0 for bound in tolerances.values()):
+            scales = [row.scale(tolerances) for row in rows]
+            share = statistics.share_within(scales, SCALES)
+            curve = ToleranceCurve(scale=list(SCALES), pc_success=share.tolist())
+            scale = _sharpest(scales)
+        return cls(
+            n_lost=sum(end.lost for end in ends),
+            errors={
+                name: SettledErrorSummary.of([end.errors[name] for end in ends])
+                for name in rows[0].errors
+            },
+            success_by_scale=curve,
+            sharpest_95=Sharpest(
+                scale=scale,
+                errors={
+                    name: _sharpest([math.inf if end.lost else end.errors[name] for end in ends])
+                    for name in rows[0].errors
+                },
+            ),
+        )
 
 
 class Summary(_Block):
@@ -237,18 +279,8 @@ class Summary(_Block):
         n_clipped: Control steps, over all episodes, whose action was out of range.
         steps_to_goal_mean: Mean over successes; None if there is none.
         success_by_step: Share solved within 1, 2, ... control steps (percent).
-        position_error_mm: Error over all episodes, likewise the three below.
-        lateral_error_mm: In the target plane.
-        height_error_mm: Along the surface normal.
-        tilt_error_deg: Between flange axis and inward surface normal.
-        settled_position_error_mm: Error at the time limit, the goal not ending the episode;
-            likewise the three below. An arm that was lost counts where it stopped.
-        settled_lateral_error_mm: In the target plane.
-        settled_height_error_mm: Along the surface normal.
-        settled_tilt_error_deg: Between flange axis and inward surface normal.
-        settled_n_lost: Episodes that ended in a collision or a failure, before or after the goal.
-        settled_success_by_scale: Success against tolerance; lost episodes are never a success.
-        settled_sharpest_95: The sharpest tolerance met in 95 % of the scenarios.
+        errors: Each metric over all episodes, where each was scored.
+        settled: Where they ended.
     """
 
     task: str
@@ -264,17 +296,8 @@ class Summary(_Block):
     n_clipped: Count
     steps_to_goal_mean: float | None
     success_by_step: list[Percent]
-    position_error_mm: ErrorSummary
-    lateral_error_mm: ErrorSummary
-    height_error_mm: ErrorSummary
-    tilt_error_deg: ErrorSummary
-    settled_position_error_mm: SettledErrorSummary
-    settled_lateral_error_mm: SettledErrorSummary
-    settled_height_error_mm: SettledErrorSummary
-    settled_tilt_error_deg: SettledErrorSummary
-    settled_n_lost: Count
-    settled_success_by_scale: ToleranceCurve
-    settled_sharpest_95: Sharpest
+    errors: dict[str, ErrorSummary]
+    settled: SettledSummary
 
     @classmethod
     def of(
@@ -300,14 +323,7 @@ class Summary(_Block):
         to_goal = [row.steps_to_goal for row in rows if row.steps_to_goal is not None]
         n_success = len(to_goal)
         failures = Counter(row.failure for row in rows if row.failure is not None)
-        scales = [row.scale(tolerances) for row in rows]
-        curve = statistics.share_within(scales, SCALES)
         solved = statistics.share_solved_by([row.steps_to_goal for row in rows], time_limit_steps)
-        errors: dict[str, Any] = {}
-        for name in ERRORS:
-            errors[name] = ErrorSummary.of([getattr(row, name) for row in rows])
-            settled = [getattr(row, f"settled_{name}") for row in rows]
-            errors[f"settled_{name}"] = SettledErrorSummary.of(settled)
         return cls(
             task=task,
             policy=policy,
@@ -322,21 +338,10 @@ class Summary(_Block):
             n_clipped=sum(row.n_clipped for row in rows),
             steps_to_goal_mean=sum(to_goal) / n_success if to_goal else None,
             success_by_step=solved.tolist(),
-            **errors,
-            settled_n_lost=sum(row.settled_lost for row in rows),
-            settled_success_by_scale=ToleranceCurve(scale=list(SCALES), pc_success=curve.tolist()),
-            settled_sharpest_95=Sharpest(
-                scale=_sharpest(scales),
-                **{
-                    name: _sharpest(
-                        [
-                            math.inf if row.settled_lost else getattr(row, f"settled_{name}")
-                            for row in rows
-                        ]
-                    )
-                    for name in ERRORS
-                },
-            ),
+            errors={
+                name: ErrorSummary.of([row.errors[name] for row in rows]) for name in rows[0].errors
+            },
+            settled=SettledSummary.of(rows, tolerances),
         )
 
 
@@ -348,7 +353,7 @@ class Metadata(_Block):
         suite_version: Version of hvs_suite.
         task_version: Version of the named task.
         task_digest: Digest of the task's meaning, from the lock file.
-        tolerances: Bound of each error that the task bounds (mm, deg).
+        tolerances: Bound of each metric that decides success, in the metric's unit.
         time_limit_steps: The task's time limit (control steps).
         options: Options that differ from the named task's; empty for a score.
         policy_kind: ``builtin``, ``checkpoint``, ``module`` (a person's own code) or ``server``.
@@ -359,6 +364,8 @@ class Metadata(_Block):
         training_hours: Hours of training, as far as the checkpoint tells.
         decision_limit_s: Time after which a decision lost its episode (s).
         actions_sha256: SHA-256 of the action log, ``<file stem>.actions.npz`` beside the file.
+        n_logged: How many scenarios, from 0 up, the log holds. What a built-in policy did in the
+            others is found out by letting it play again.
         packages: Version of each package that can change a number.
         gl_renderer: The OpenGL renderer that drew the images; None if none were drawn.
         cpu: Processor model.
@@ -379,6 +386,7 @@ class Metadata(_Block):
     training_hours: Seconds | None
     decision_limit_s: Seconds
     actions_sha256: Annotated[str, pydantic.Field(pattern="^[0-9a-f]{64}$")]
+    n_logged: Annotated[int, pydantic.Field(ge=1)]
     packages: dict[str, str]
     gl_renderer: str | None
     cpu: str
@@ -386,10 +394,10 @@ class Metadata(_Block):
 
     @pydantic.model_validator(mode="after")
     def _agree(self) -> Self:
-        """Refuses tolerances on what is no error."""
+        """Refuses bounds that nothing can meet."""
         for name, bound in self.tolerances.items():
-            if name not in ERRORS or not bound > 0:
-                raise ValueError(f"tolerances.{name} is no bound on an error")
+            if not 0.0 <= bound < math.inf:
+                raise ValueError(f"tolerances.{name} is no bound on a metric")
         return self
 
 
@@ -415,7 +423,7 @@ class Timings(_Block):
 class Result(_Block):
     """A result file; see the module's text for its blocks."""
 
-    schema_version: Literal[2]
+    schema_version: Literal[3]
     summary: Summary
     metadata: Metadata
     timings: Timings
@@ -423,15 +431,17 @@ class Result(_Block):
 
     @pydantic.model_validator(mode="after")
     def _agree(self) -> Self:
-        """Refuses rows that are not scenarios 0..N-1, and a summary that is not theirs."""
-        scenarios = [row.scenario for row in self.episodes]
-        seen: set[int] = set()
-        for scenario in scenarios:
-            if scenario in seen:
-                raise ValueError(f"scenario {scenario} appears more than once")
-            seen.add(scenario)
-        if scenarios != list(range(len(scenarios))):
-            raise ValueError("the rows must be scenarios 0..N-1 in this order")
+        """Refuses rows that are not alike, and a summary that is not theirs."""
+        if [row.scenario for row in self.episodes] != list(range(len(self.episodes))):
+            raise ValueError("episodes are scenarios 0..N-1, in this order")
+        metrics = self.episodes[0].errors.keys()
+        if any(row.errors.keys() != metrics for row in self.episodes):
+            raise ValueError("all rows must have the same metrics")
+        if not self.metadata.tolerances.keys() <= metrics:
+            raise ValueError("metadata.tolerances bounds what is no metric")
+        n_logged, kind = self.metadata.n_logged, self.metadata.policy_kind
+        if n_logged > len(self.episodes) or (n_logged < len(self.episodes) and kind != "builtin"):
+            raise ValueError("metadata.n_logged must be the number of rows")
         ours = self.summary
         theirs = Summary.of(
             ours.task,
@@ -459,11 +469,76 @@ def write(result: Result, path: Path) -> None:
         OutputError: The file cannot be written.
     """
     blocks = result.model_dump(mode="json")
+    blocks["episodes"] = _columns(blocks["episodes"])
     blocks = {"schema_version": blocks.pop("schema_version"), "sha256": seal(blocks), **blocks}
-    rows = ",\n    ".join(json.dumps(row, allow_nan=False) for row in blocks.pop("episodes"))
+    columns = _text(blocks.pop("episodes"), "  ")
     head = json.dumps(blocks, indent=2, allow_nan=False).removesuffix("\n}")
     with files.replacing(path) as temporary:
-        temporary.write_text(f'{head},\n  "episodes": [\n    {rows}\n  ]\n}}\n', encoding="utf-8")
+        temporary.write_text(f'{head},\n  "episodes": {columns}\n}}\n', encoding="utf-8")
+
+
+def _columns(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Rows as columns; one that holds the same value throughout is that value.
+
+    The scenarios are 0..N-1 and left out, as are settled figures that are the episodes' own.
+    """
+    columns: dict[str, Any] = {}
+    for name in rows[0]:
+        values = [row[name] for row in rows]
+        if name == "scenario":
+            continue
+        if isinstance(values[0], dict):
+            columns[name] = _columns(values)
+        else:
+            same = all(value == values[0] for value in values)
+            columns[name] = values[0] if same else values
+    if "settled" in columns:
+        columns["settled"] = {
+            name: column
+            for name, column in columns["settled"].items()
+            if column != columns.get(name, ...)
+        }
+    return columns
+
+
+def _rows(columns: Mapping[str, Any], n: int) -> list[dict[str, Any]]:
+    """What `_columns` was made of.
+
+    Raises:
+        ValueError: A column is not as long as there are rows.
+    """
+    if isinstance(columns.get("settled"), dict):
+        own = {name: columns[name] for name in Settled.model_fields if name in columns}
+        columns = {**columns, "settled": own | columns["settled"]}
+    spread: dict[str, list[Any]] = {}
+    for name, column in columns.items():
+        if isinstance(column, dict):
+            spread[name] = _rows(column, n)
+        elif isinstance(column, list):
+            if len(column) != n:
+                raise ValueError(f"{name} holds {len(column)} values for {n} episodes")
+            spread[name] = column
+        else:
+            spread[name] = [column] * n
+    return [{name: values[i] for name, values in spread.items()} for i in range(n)]
+
+
+def _n_columns(columns: Mapping[str, Any]) -> int:
+    return sum(_n_columns(c) if isinstance(c, dict) else 1 for c in columns.values()) + 1
+
+
+def _text(columns: Mapping[str, Any], indent: str) -> str:
+    """Columns as JSON, one a line: readable, and a difference shows in which column it is."""
+    lines = [
+        f"{indent}  {json.dumps(name)}: "
+        + (
+            _text(column, indent + "  ")
+            if isinstance(column, dict)
+            else json.dumps(column, separators=(",", ":"), allow_nan=False)
+        )
+        for name, column in columns.items()
+    ]
+    return "{\n" + ",\n".join(lines) + f"\n{indent}}}"
 
 
 def seal(content: Mapping[str, Any]) -> str:
@@ -491,7 +566,8 @@ def load(path: Path) -> Result:
             f"{SCHEMA_VERSION}; evaluate again with this version"
         )
     sealed = content.pop("sha256", None)
-    result = reading.validated(Result, content, path, error=ResultError)
+    unsealed = {**content, "episodes": _episodes(path, content)}
+    result = reading.validated(Result, unsealed, path, error=ResultError)
     try:
         fits = sealed == seal(content)
     except ValueError as error:
@@ -499,6 +575,25 @@ def load(path: Path) -> Result:
     if not fits:
         raise ResultError(f"{path}: was changed after it was written (sha256); evaluate again")
     return result
+
+
+def _episodes(path: Path, content: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The rows of a file's columns.
+
+    Raises:
+        ResultError: They are no columns of as many values as the summary says.
+    """
+    columns, summary = content.get("episodes"), content.get("summary")
+    n = summary.get("n_episodes") if isinstance(summary, dict) else None
+    if not isinstance(columns, dict) or not isinstance(n, int) or not 0 < n <= MOST_EPISODES:
+        raise ResultError(f"{path}: holds no columns of episodes; evaluate again")
+    if _n_columns(columns) > MOST_COLUMNS:
+        raise ResultError(f"{path}: holds more than {MOST_COLUMNS} columns of episodes")
+    try:
+        rows = _rows(columns, n)
+    except ValueError as error:
+        raise ResultError(f"{path}: episodes: {error}; evaluate again") from error
+    return [{"scenario": index, **row} for index, row in enumerate(rows)]
 
 
 def _sharpest(errors: Sequence[float]) -> float | None:

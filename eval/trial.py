@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.errors import OptionError, describe
-from hvs_suite.eval.result_file import ERRORS, EpisodeRow
+from hvs_suite.eval.result_file import EpisodeRow, Settled
 from hvs_suite.rollout import Action, Observation, Policy, library_seeds
 
 NOT_FINITE = "not finite"
@@ -34,9 +34,6 @@ DECISION_LIMIT_S = 10.0
 LONGEST_DECISION_LIMIT_S = 3600.0
 # A policy in another process keeps the time itself; this much later the alarm goes off anyway (s).
 _GRACE_S = 5.0
-NEAR_MM = 1e-3
-"""Re-simulated errors may differ by this much (mm): another processor rounds differently."""
-NEAR_DEG = 1e-5
 # A nanometre: enough digits for any judgement, few enough to read.
 _DIGITS = 6
 
@@ -55,10 +52,6 @@ class Stage(Protocol):
     @property
     def landing_mm(self) -> npt.NDArray[np.float64]:
         """Where the flange stands over the target, (2,) mm."""
-
-    @property
-    def spec(self) -> Any:
-        """The task's parameters."""
 
     def action_spec(self) -> Any:
         """Returns the `dm_env.specs.BoundedArray` of actions."""
@@ -110,7 +103,7 @@ class Trial:
 
     Attributes:
         row: Its outcome.
-        actions: (settled_steps, 7) float32, as the policy gave them, before clipping.
+        actions: (settled.steps, 7) float32, as the policy gave them, before clipping.
         decision_s: Wall time spent in the policy, summed (s).
         slowest_s: Its longest decision (s).
         play_s: Wall time of the whole trial in the process that played it, reset included (s).
@@ -125,129 +118,20 @@ class Trial:
     detail: str
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class Course:
-    """How a scenario went, step by step: all that its row is made of.
-
-    Attributes:
-        scenario: Index in the split.
-        hold_steps: Consecutive control steps inside the tolerances that make a success.
-        actions: (n, 7) float32, as the policy gave them, before clipping.
-        inside: (n,) whether the task took the flange to be inside the tolerances.
-        excess: (n,) largest excess of an error over its bound, in units of `NEAR_MM` and
-            `NEAR_DEG`: inside below 0, outside above, and between -1 and 1 rounding may decide. A
-            collision is outside by infinity.
-        clipped: (n,) whether the action was out of range.
-        errors: Errors (mm, deg) after the reset and after each step, n + 1 of them.
-        collision: A forbidden contact ended it.
-        truncated: The time limit did.
-        failure: Why the policy lost it; None if it did not.
-        landing_mm: (2,) where the flange stood over the target at the end (mm).
-    """
-
-    scenario: int
-    hold_steps: int
-    actions: npt.NDArray[np.float32]
-    inside: npt.NDArray[np.bool_]
-    excess: npt.NDArray[np.float64]
-    clipped: npt.NDArray[np.bool_]
-    errors: Sequence[Mapping[str, float]]
-    collision: bool
-    truncated: bool
-    failure: str | None
-    landing_mm: npt.NDArray[np.float64]
-
-    def row(self, inside: npt.NDArray[np.bool_] | None = None) -> EpisodeRow:
-        """Returns the row that this course makes.
-
-        Args:
-            inside: (n,) verdicts on each step to go by; those of the task by default.
-        """
-        inside = self.inside if inside is None else inside
-        n = len(self.actions)
-        goal = self._goal(inside)
-        steps = n if goal is None else goal
-        settled = {f"settled_{name}": value for name, value in self.errors[n].items()}
-        x, y = self.landing_mm
-        return EpisodeRow(
-            scenario=self.scenario,
-            success=goal is not None,
-            success_once=bool(inside[:steps].any()),
-            collision=goal is None and self.collision,
-            truncated=goal is None and self.truncated,
-            steps=steps,
-            steps_to_goal=goal,
-            n_clipped=int(self.clipped[:steps].sum()),
-            **self.errors[steps],
-            failure=self.failure if goal is None else None,
-            settled_steps=n,
-            settled_collision=self.collision,
-            settled_failure=self.failure,
-            **settled,
-            settled_x_mm=round(float(x), _DIGITS),
-            settled_y_mm=round(float(y), _DIGITS),
-        )
-
-    def could_be(self, claimed: EpisodeRow) -> EpisodeRow:
-        """Returns the row of this course that comes closest to a claimed one.
-
-        Only verdicts within a rounding of a bound may be turned, and only to the claimed outcome.
-
-        Args:
-            claimed: A row of this scenario.
-
-        Returns:
-            A row with the claimed outcome if rounding can have decided it; else that of `row`.
-        """
-        surely = self.inside & (self.excess < -1.0)
-        near = np.flatnonzero(np.abs(self.excess) <= 1.0)
-        # Without a turned verdict too many, so that none makes a success before the claimed one.
-        turned: list[npt.NDArray[np.intp]] = [near[:0]]
-        if claimed.success:
-            held = range(claimed.steps - self.hold_steps, claimed.steps)
-            turned = [near[np.isin(near, held)]]
-        elif claimed.success_once:
-            turned += [near[k : k + 1] for k in range(len(near))]
-        found = self.row()
-        if same_outcome(found, claimed):
-            return found
-        for steps in turned:
-            inside = surely.copy()
-            inside[steps] = True
-            other = self.row(inside)
-            if same_outcome(other, claimed):
-                return other
-        return found
-
-    def _goal(self, inside: npt.NDArray[np.bool_]) -> int | None:
-        """Returns after how many steps the goal had been held; None if it never was."""
-        held = 0
-        for step, is_inside in enumerate(inside.tolist(), 1):
-            held = held + 1 if is_inside else 0
-            if held >= self.hold_steps:
-                return step
-        return None
-
-
-OUTCOME = (
-    "success",
-    "success_once",
-    "collision",
-    "truncated",
-    "steps",
-    "steps_to_goal",
-    "n_clipped",
-    "failure",
-    "settled_steps",
-    "settled_collision",
-    "settled_failure",
-)
-"""What a row says of an episode apart from its errors."""
-
-
 def same_outcome(one: EpisodeRow, other: EpisodeRow) -> bool:
     """Whether two rows differ in nothing but their errors."""
-    return all(getattr(one, name) == getattr(other, name) for name in OUTCOME)
+    return outcome(one) == outcome(other)
+
+
+def outcome(row: EpisodeRow) -> dict[str, Any]:
+    """Returns what a row says of an episode apart from its errors, by name."""
+    figures = row.model_dump(exclude={"errors": True, "settled": True})
+    end = row.settled
+    return figures | {
+        "settled.steps": end.steps,
+        "settled.collision": end.collision,
+        "settled.failure": end.failure,
+    }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -270,7 +154,9 @@ class PlayTrial:
         return _play_policy(env, policy, scenario, seed, self.decision_limit_s)
 
 
-def play_trial(env: Stage, start: Callable[[], None], decide: Decide, scenario: int) -> Course:
+def play_trial(
+    env: Stage, start: Callable[[], None], decide: Decide, scenario: int
+) -> tuple[EpisodeRow, npt.NDArray[np.float32]]:
     """Plays one scenario with a function of the observation.
 
     Args:
@@ -281,41 +167,44 @@ def play_trial(env: Stage, start: Callable[[], None], decide: Decide, scenario: 
         scenario: Index in the environment's split.
 
     Returns:
-        How it went.
+        Row, and actions (n, 7) float32 before clipping.
     """
     env.goal_ends_episode = False
     spec = env.action_spec()
     low, high = np.float32(spec.minimum), np.float32(spec.maximum)
     time_step = env.reset(scenario=scenario)
     actions: list[Action] = []
-    clipped: list[bool] = []
-    infos = [env.info]
+    n_clipped = 0
+    scored: dict[str, Any] | None = None
     failure: str | None = None
+    info = env.info
     try:
         start()
         while not time_step.last():
             action = decide(time_step.observation)
             # Both are float32, and np.clip takes three times as long.
             executed = np.minimum(np.maximum(action, low), high)
+            n_clipped += bool((executed != action).any())
             time_step = env.step(executed)
-            clipped.append(bool((executed != action).any()))
             actions.append(action)
-            infos.append(env.info)
+            info = env.info
+            if scored is None and info["is_success"]:
+                scored = _scored(info, len(actions), n_clipped, None)
     except EpisodeLostError as error:
         failure = error.reason
-    return Course(
-        scenario=int(scenario),
-        hold_steps=env.spec.hold_steps,
-        actions=np.array(actions, np.float32).reshape(-1, *spec.shape),
-        inside=np.array([info["n_inside"] > 0 for info in infos[1:]], np.bool_),
-        excess=np.array([_excess(info, env.spec.tolerances) for info in infos[1:]], np.float64),
-        clipped=np.array(clipped, np.bool_),
-        errors=[_errors(info) for info in infos],
-        collision=bool(infos[-1]["collision"]),
-        truncated=bool(infos[-1]["truncated"]),
+    if scored is None:
+        scored = _scored(info, len(actions), n_clipped, failure)
+    x, y = env.landing_mm
+    settled = Settled(
+        steps=len(actions),
+        collision=bool(info["collision"]),
         failure=failure,
-        landing_mm=np.array(env.landing_mm),
+        errors=_errors(info),
+        x_mm=round(float(x), _DIGITS),
+        y_mm=round(float(y), _DIGITS),
     )
+    row = EpisodeRow(scenario=int(scenario), **scored, settled=settled)
+    return row, np.array(actions, np.float32).reshape(-1, *spec.shape)
 
 
 def _play_policy(env: Stage, policy: Policy, scenario: int, seed: int, limit_s: float) -> Trial:
@@ -366,10 +255,10 @@ def _play_policy(env: Stage, policy: Policy, scenario: int, seed: int, limit_s: 
         guarded(policy.reset)
 
     with contextlib.ExitStack() as seeds, _alarm_clock() as set_alarm:
-        course = play_trial(env, start, decide, scenario)
+        row, actions = play_trial(env, start, decide, scenario)
     return Trial(
-        row=course.row(),
-        actions=course.actions,
+        row=row,
+        actions=actions,
         decision_s=sum(times),
         slowest_s=max(times),
         play_s=time.perf_counter() - begun,
@@ -453,15 +342,23 @@ def _alarm_clock() -> Iterator[Callable[[float], object]]:
             signal.setitimer(signal.ITIMER_REAL, left)
 
 
+def _scored(
+    info: Mapping[str, Any], steps: int, n_clipped: int, failure: str | None
+) -> dict[str, Any]:
+    """The scored part of a row."""
+    success = bool(info["is_success"]) and failure is None
+    return {
+        "success": success,
+        "success_once": bool(info["success_once"]),
+        "collision": bool(info["collision"]),
+        "truncated": bool(info["truncated"]) and not success,
+        "steps": steps,
+        "steps_to_goal": info["steps_to_goal"] if success else None,
+        "n_clipped": n_clipped,
+        "failure": failure,
+        "errors": _errors(info),
+    }
+
+
 def _errors(info: Mapping[str, Any]) -> dict[str, float]:
-    return {name: round(float(info[name]), _DIGITS) for name in ERRORS}
-
-
-def _excess(info: Mapping[str, Any], tolerances: Mapping[str, float]) -> float:
-    """Largest excess of an error over its bound, as in `Course`."""
-    if info["collision"]:
-        return np.inf
-    return max(
-        (float(info[name]) - bound) / (NEAR_DEG if name.endswith("deg") else NEAR_MM)
-        for name, bound in tolerances.items()
-    )
+    return {name: round(float(value), _DIGITS) for name, value in info["errors"].items()}

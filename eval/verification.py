@@ -10,30 +10,26 @@ import dataclasses
 import hashlib
 import math
 import secrets
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from hvs_suite import registry, rollout
 from hvs_suite.errors import OptionError, ResultError
-from hvs_suite.eval import action_log, result_file
+from hvs_suite.eval import action_log, contender, result_file
 from hvs_suite.eval.protocol import MakeTask
 from hvs_suite.eval.result_file import EpisodeRow, Result
-from hvs_suite.eval.trial import (
-    NEAR_DEG,
-    NEAR_MM,
-    OUTCOME,
-    EpisodeLostError,
-    Stage,
-    play_trial,
-    same_outcome,
-)
-from hvs_suite.policies import builtin
+from hvs_suite.eval.trial import EpisodeLostError, Stage, outcome, play_trial, same_outcome
+from hvs_suite.names import shown
+from hvs_suite.policies import builtin, catalogue
 from hvs_suite.rollout import Action, Observation
 from hvs_suite.tasks.shared import lock
 
+NEAR: Mapping[str, float] = {"mm": 1e-3, "deg": 1e-5}
+"""Re-simulated metrics may differ by this much, by unit: another processor rounds differently."""
+NEAR_OTHERWISE = 1e-3
 LOG_ENDS = "the action log ends"
 MOST_NEAR_PER_MILLE = 5
 """Outcomes of a thousand that rounding may decide, at least one: far more than chance brings, and
@@ -49,16 +45,20 @@ class Verdict:
         n_played: Those that were played again.
         n_near: Those of them whose outcome rounding decided, at a bound on an error.
         nonce: What a sample was drawn with; None where all were played.
-        largest_mm: Largest difference of a position error (mm).
-        largest_deg: Largest difference of a tilt error (deg).
+        largest: Largest difference of a metric, by unit.
     """
 
     n_episodes: int
     n_played: int
     n_near: int
     nonce: str | None
-    largest_mm: float
-    largest_deg: float
+    largest: Mapping[str, float]
+
+
+class ReplayStage(Stage, Protocol):
+    """What a replay needs of an environment beyond a trial."""
+
+    slack: Mapping[str, float]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ class ReplayTrial:
     """Plays a scenario's logged actions, for `rollout.play`.
 
     Attributes:
-        actions: (steps, 7) of each scenario.
+        actions: (steps, 7) of each scenario that is logged; in others the policy itself plays.
         claimed: What the result says of each; why its policy had no further action is believed.
     """
 
@@ -74,24 +74,42 @@ class ReplayTrial:
     claimed: Mapping[int, EpisodeRow]
 
     def __call__(
-        self, env: Stage, policy: rollout.Policy, scenario: int
+        self, env: ReplayStage, policy: rollout.Policy, scenario: int
     ) -> tuple[EpisodeRow, bool]:
         """Returns the row that the actions give, and whether rounding decided its outcome.
 
-        Where rounding can have decided it as claimed, it is taken to have done so.
+        Where the claimed outcome is another, the scenario is played with bounds that are a rounding
+        wider, and a rounding narrower: if that gives the claimed outcome, exactly, rounding is
+        taken to have decided it.
         """
         claimed = self.claimed[scenario]
-        remaining = iter(self.actions[scenario])
+        found, log = self._play(env, policy, scenario, self.actions.get(scenario))
+        if same_outcome(found, claimed):
+            return found, False
+        try:
+            for sign in (1.0, -1.0):
+                env.slack = {unit: sign * near for unit, near in NEAR.items()}
+                other, _ = self._play(env, policy, scenario, log)
+                if same_outcome(other, claimed):
+                    return other, True
+        finally:
+            env.slack = {}
+        return found, False
+
+    def _play(
+        self, env: ReplayStage, policy: rollout.Policy, scenario: int, log: Action | None
+    ) -> tuple[EpisodeRow, Action]:
+        if log is None:
+            return play_trial(env, policy.reset, policy.select_action, scenario)
+        remaining = iter(log)
 
         def decide(observation: Observation) -> Action:
             action = next(remaining, None)
             if action is None:
-                raise EpisodeLostError(claimed.settled_failure or LOG_ENDS)
+                raise EpisodeLostError(self.claimed[scenario].settled.failure or LOG_ENDS)
             return action
 
-        course = play_trial(env, lambda: None, decide, scenario)
-        found = course.could_be(claimed)
-        return found, not same_outcome(found, course.row())
+        return play_trial(env, lambda: None, decide, scenario)
 
 
 def verify(
@@ -130,27 +148,60 @@ def verify(
     else:
         nonce = new_nonce() if nonce is None else nonce
         chosen = drawn(len(rows), sample, nonce)
-    replay = ReplayTrial(
-        {index: log[index] for index in chosen},
-        {index: rows[index] for index in chosen},
-    )
-    task = MakeTask(result.summary.task, result.summary.split, pictures=False)
     n_near, largest = 0, {"mm": 0.0, "deg": 0.0}
-    with contextlib.closing(
-        rollout.play(task, builtin.make_zero, chosen, replay, workers=workers)
-    ) as played:
-        for row, by_rounding in played:
-            _compare(path, rows[row.scenario], row, largest)
-            n_near += by_rounding
-            if progress is not None:
-                progress()
+    for scenarios, make, pictures in _in_parts(path, result, chosen, len(log)):
+        replay = ReplayTrial(
+            {index: log[index] for index in scenarios if index < len(log)},
+            {index: rows[index] for index in scenarios},
+        )
+        task = MakeTask(result.summary.task, result.summary.split, pictures=pictures)
+        with contextlib.closing(
+            rollout.play(task, make, scenarios, replay, workers=workers)
+        ) as played:
+            for row, by_rounding in played:
+                _compare(path, rows[row.scenario], row, largest)
+                n_near += by_rounding
+                if progress is not None:
+                    progress()
     most = max(1, MOST_NEAR_PER_MILLE * len(chosen) // 1000)
     if n_near > most:
         raise ResultError(
             f"{path}: rounding would have decided {n_near} of {len(chosen)} outcomes as the file "
             f"says; more than {most} is no chance"
         )
-    return Verdict(len(rows), len(chosen), n_near, nonce, largest["mm"], largest["deg"])
+    return Verdict(len(rows), len(chosen), n_near, nonce, largest)
+
+
+def _in_parts(
+    path: Path, result: Result, chosen: Sequence[int], n_logged: int
+) -> Iterator[tuple[list[int], rollout.PolicyFactory, bool]]:
+    """What is logged is replayed without pictures; a built-in policy plays the rest itself."""
+    logged = [index for index in chosen if index < n_logged]
+    if logged:
+        yield logged, builtin.make_zero, False
+    rest = [index for index in chosen if index >= n_logged]
+    if rest:
+        yield rest, builtin_policy(path, result), True
+
+
+def builtin_policy(path: Path, result: Result) -> rollout.PolicyFactory:
+    """Returns the built-in policy that a result names.
+
+    Args:
+        path: The result's file.
+        result: What it holds.
+
+    Raises:
+        ResultError: There is none of this name. Any other name is not looked for: a stranger's file
+            must not choose code to run or weights to load.
+    """
+    policy = result.summary.policy
+    if policy not in catalogue.BUILTIN:
+        raise ResultError(
+            f"{path}: {shown(policy)!r} is no built-in policy, but the action log does not hold "
+            "all scenarios; evaluate again"
+        )
+    return contender.find(policy, result.summary.task).make
 
 
 def check_task(path: Path, result: Result) -> None:
@@ -172,6 +223,7 @@ def check_task(path: Path, result: Result) -> None:
         ("task_digest", metadata.task_digest, lock.digest(ours)),
         ("tolerances", metadata.tolerances, spec.tolerances),
         ("time_limit_steps", metadata.time_limit_steps, spec.time_limit_steps),
+        ("metrics", sorted(result.episodes[0].errors), sorted(m.name for m in spec.metrics)),
     ):
         if said != known:
             raise ResultError(
@@ -188,21 +240,22 @@ def load_actions(path: Path, result: Result) -> list[action_log.Actions]:
         result: What it holds.
 
     Returns:
-        (steps, 7) float32 of each of its rows.
+        (steps, 7) float32 of each of its first `Metadata.n_logged` rows.
 
     Raises:
         ResultError: The log cannot be read, is another one, or is not as long as the rows say.
     """
     log = action_log.load(result_file.actions_path(path), result.metadata.actions_sha256)
     rows = result.episodes
-    if len(log) != len(rows):
+    n_logged = result.metadata.n_logged
+    if len(log) != n_logged:
         raise ResultError(
-            f"{path}: the action log holds {len(log)} scenarios, the result {len(rows)}"
+            f"{path}: the action log holds {len(log)} scenarios, the result says {n_logged}"
         )
-    for row, actions in zip(rows, log, strict=True):
-        if len(actions) != row.settled_steps:
+    for row, actions in zip(rows[:n_logged], log, strict=True):
+        if len(actions) != row.settled.steps:
             raise ResultError(
-                f"{path}: scenario {row.scenario}: settled_steps is {row.settled_steps}, but "
+                f"{path}: scenario {row.scenario}: settled.steps is {row.settled.steps}, but "
                 f"{len(actions)} actions are logged"
             )
         if len(actions) > result.metadata.time_limit_steps:
@@ -232,22 +285,31 @@ def _compare(path: Path, said: EpisodeRow, found: EpisodeRow, largest: dict[str,
         ResultError: They differ.
     """
     where = f"{path}: scenario {said.scenario}"
-    for name in OUTCOME:
-        if getattr(said, name) != getattr(found, name):
+    theirs = outcome(found)
+    for name, value in outcome(said).items():
+        if value != theirs[name]:
             raise ResultError(
-                f"{where}: {name} is {getattr(said, name)}, but the logged actions give "
-                f"{getattr(found, name)}"
+                f"{where}: {name} is {value}, but the logged actions give {theirs[name]}"
             )
-    settled = [f"settled_{name}" for name in (*result_file.ERRORS, "x_mm", "y_mm")]
-    for name in (*result_file.ERRORS, *settled):
-        unit, bound = ("deg", NEAR_DEG) if name.endswith("deg") else ("mm", NEAR_MM)
-        ours, theirs = getattr(said, name), getattr(found, name)
-        largest[unit] = max(largest[unit], abs(ours - theirs))
+    played = _figures(found)
+    for name, figure in _figures(said).items():
+        unit = name.rpartition("_")[2]
+        if name not in played:
+            raise ResultError(f"{where}: {name} is no metric of the task")
+        largest[unit] = max(largest.get(unit, 0.0), abs(figure - played[name]))
         # Both are rounded to a millionth, which may part them by one more.
-        if not math.isclose(ours, theirs, rel_tol=0.0, abs_tol=bound + 2e-6):
+        bound = NEAR.get(unit, NEAR_OTHERWISE) + 2e-6
+        if not math.isclose(figure, played[name], rel_tol=0.0, abs_tol=bound):
             raise ResultError(
-                f"{where}: {name} is {ours}, but the logged actions give {theirs} {unit}"
+                f"{where}: {name} is {figure}, but the logged actions give {played[name]}"
             )
+
+
+def _figures(row: EpisodeRow) -> dict[str, float]:
+    """Every metric of a row, and where it landed, by name."""
+    end = row.settled
+    settled = {f"settled.{name}": value for name, value in end.errors.items()}
+    return row.errors | settled | {"settled.x_mm": end.x_mm, "settled.y_mm": end.y_mm}
 
 
 def results_in(paths: Sequence[Path]) -> list[Path]:

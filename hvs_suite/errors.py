@@ -59,8 +59,21 @@ def describe(error: BaseException) -> str:
     Args:
         error: Of other people's code, say.
     """
+    name, text = type(error).__name__, first_line(error)
+    return name if text == name else f"{name}: {text}"
+
+
+def first_line(error: BaseException) -> str:
+    """What an exception of somebody else's code says, as one line.
+
+    Args:
+        error: The exception; it may say nothing, or raise another when it is asked.
+
+    Returns:
+        The first line of its text, or its type's name.
+    """
     try:
-        text = str(error)
-    except Exception:
-        text = ""
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+        lines = str(error).splitlines()
+    except Exception:  # somebody else's __str__ raises anything
+        lines = []
+    return lines[0] if lines else type(error).__name__

@@ -31,9 +31,9 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         descriptor, name = tempfile.mkstemp(
             dir=target.parent, prefix=f".{target.stem}-", suffix=target.suffix
         )
+        os.close(descriptor)
     except OSError as error:
-        raise OutputError(f"cannot write {target}: {error.strerror}") from error
-    os.close(descriptor)
+        raise OutputError(f"cannot write {target}: {error.strerror or error}") from error
     temporary = Path(name)
     try:
         yield temporary

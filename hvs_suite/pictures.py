@@ -274,11 +274,15 @@ def _draw_standing(
         ("step", f"{info['steps']} of {spec.time_limit_steps}", None)
     ]
     for metric in spec.metrics:
+        is_bounded_step = metric.over == "step" and metric.bound is not None
+        if not is_bounded_step and (metric.over == "step" or metric.name not in spec.headline):
+            continue
+        error = info["errors"][metric.name]
+        unit = "°" if metric.unit == "deg" else f" {metric.unit}".rstrip()
+        text, good = f"{error:.2f}{unit}", None
         if metric.bound is not None:
-            error = info["errors"][metric.name]
-            unit = "°" if metric.unit == "deg" else f" {metric.unit}".rstrip()
-            text = f"{error:.2f}{unit}  (≤ {metric.bound:g}{unit})"
-            rows.append((metric.title.removesuffix(" error"), text, error <= metric.bound))
+            text, good = f"{text}  (≤ {metric.bound:g}{unit})", error <= metric.bound
+        rows.append((metric.title.removesuffix(" error"), text, good))
     terms = ", ".join(f"{name} {value:+.2f}" for name, value in reward_terms.items() if value)
     rows.append(
         (
@@ -289,11 +293,14 @@ def _draw_standing(
             None,
         )
     )
+    widest = max(draw.textlength(label, font(14)) for label, _, _ in rows)
+    left = MARGIN + max(80, round(widest) + 14)
+    height = min(ROW_HEIGHT, (CELL_SIDE - MARGIN - top) // len(rows))
     for row, (label, text, good) in enumerate(rows):
-        y = top + row * ROW_HEIGHT
+        y = top + row * height
         draw.text((MARGIN, y), label, FAINT, font(14))
         colour = INK if good is None else (GREEN if good else RED)
-        draw.text((MARGIN + 80, y), text, colour, font(14))
+        draw.text((left, y), text, colour, font(14))
     end = _ending(info)
     if end is not None:
         word, colour = end

@@ -35,6 +35,11 @@ _NPZ_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _ENCRYPTED = 0x1
 MOST_PARQUET_BYTES = 2 * 2**30
 """Of a parquet file, packed and unpacked: LeRobot begins a new one at 100 MB."""
+# Pictures are compressed already: parquet makes next to nothing of them.
+_PARQUET_EXPANSION = 20
+_PARQUET_ALLOWANCE_BYTES = 64 * 2**20
+_MOST_ROWS_AT_ONCE = 4096
+_PARQUET_TEXTS = ("BYTE_ARRAY", "FIXED_LEN_BYTE_ARRAY")
 # An Arrow value is 8 bytes at most, but for bytes, which count as what they unpack to.
 _ARROW_BYTES = 8
 # Magic and the header's own first bytes, then width, height, bits a channel and kind of colour.
@@ -326,10 +331,10 @@ def read_parquet(
     error: type[HvsError],
     within: Path | None = None,
 ) -> "pa.Table":
-    """Read a parquet file that says of itself that it unpacks to no more than it may.
+    """Read a parquet file that unpacks to no more than it may.
 
-    Strings and bytes stay dictionaries where they are: a file of a few bytes can name one long
-    value for each of a million rows.
+    Numbers are bounded by what the file says of itself. Strings and bytes are read a few rows at a
+    time: a file of a few bytes can name one long value for each of a million rows.
 
     Args:
         path: The file.
@@ -346,25 +351,51 @@ def read_parquet(
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    check_regular(path, error=error, within=within, most=MOST_PARQUET_BYTES)
+    size = check_regular(path, error=error, within=within, most=MOST_PARQUET_BYTES)
+    most = _PARQUET_ALLOWANCE_BYTES + _PARQUET_EXPANSION * size
     try:
         with pq.ParquetFile(path) as file:
-            chosen = _choose_columns(path, file, columns, error)
-        with pq.ParquetFile(path, read_dictionary=chosen) as file:
-            return file.read(columns)
+            names, texts = _choose_columns(path, file, columns, error)
+            numbers = [name for name in names if name not in texts]
+            parts = [file.read(numbers)] if numbers else []
+            if texts:
+                parts.append(_read_texts(path, file, texts, most, error))
+        found = {name: part.column(name) for part in parts for name in part.column_names}
+        return pa.table({name: found[name] for name in names})
     except (pa.ArrowException, OSError, ValueError, LookupError, MemoryError) as reason:
         if isinstance(reason, HvsError):
             raise
         raise error(f"{path}: cannot be read ({_why(reason)})") from reason
 
 
+def _read_texts(
+    path: Path, file: "pq.ParquetFile", names: list[str], most: int, error: type[HvsError]
+) -> "pa.Table":
+    """Columns of strings or bytes; `most` bounds what they unpack to (bytes)."""
+    import pyarrow as pa
+
+    # A value is no longer than what its column unpacks to: so many of them are no bomb yet.
+    groups = map(file.metadata.row_group, range(file.metadata.num_row_groups))
+    longest = max((group.total_byte_size for group in groups), default=0)
+    rows = min(max(1, _PARQUET_ALLOWANCE_BYTES // max(1, longest)), _MOST_ROWS_AT_ONCE)
+    batches = []
+    for batch in file.iter_batches(rows, columns=names):
+        most -= batch.nbytes
+        if most < 0:
+            raise error(f"{path}: unpacks to far more than its size; no recording does")
+        batches.append(batch)
+    if not batches:
+        return pa.schema([file.schema_arrow.field(name) for name in names]).empty_table()
+    return pa.Table.from_batches(batches).combine_chunks()
+
+
 def _choose_columns(
     path: Path, file: "pq.ParquetFile", columns: Sequence[str] | None, error: type[HvsError]
-) -> list[str]:
-    """Check what the footer says of the columns to be read; the leaves of bytes among them."""
+) -> tuple[list[str], list[str]]:
+    """Check what the footer says of the columns to be read; they, and those of text among them."""
     names = file.schema_arrow.names
-    wanted = names if columns is None else columns
-    lacking = sorted(set(wanted) - set(names))
+    wanted = names if columns is None else [name for name in names if name in columns]
+    lacking = sorted(set(columns or ()) - set(names))
     if lacking:
         raise error(f"{path}: lacks the columns {', '.join(lacking)}")
     if len(set(names)) != len(names):
@@ -384,4 +415,52 @@ def _choose_columns(
             unpacked += max(chunk.total_uncompressed_size, least)
     if unpacked > MOST_PARQUET_BYTES:
         raise error(f"{path}: would unpack to more than {MOST_PARQUET_BYTES:,} bytes")
-    return [leaf.path for leaf, _ in leaves if leaf.physical_type == "BYTE_ARRAY"]
+    texts = [leaf.path for leaf, _ in leaves if leaf.physical_type in _PARQUET_TEXTS]
+    return wanted, [
+        name
+        for name in wanted
+        if any(leaf == name or leaf.startswith(f"{name}.") for leaf in texts)
+    ]
+
+
+# The library itself reads headers of up to 100 MB; one of ours takes 5 kB.
+_MOST_HEADER_BYTES = 8 * 2**20
+
+
+def tensor_shapes(
+    path: Path, *, most: int, error: type[HvsError], within: Path | None = None
+) -> dict[str, tuple[int, ...]]:
+    """Read the names and shapes of a ``safetensors`` file's tensors, and none of their numbers.
+
+    Args:
+        path: The file.
+        most: Largest size allowed (bytes).
+        error: Raised where it is not such a file.
+        within: As in `check_regular`.
+
+    Returns:
+        Shape by name. The library has checked that the tensors fill the file exactly, so that what
+        holds these shapes is no larger than the file.
+
+    Raises:
+        HvsError: As `error`: empty, cut short, of a header that is too long, or damaged.
+    """
+    try:
+        from safetensors import SafetensorError, safe_open
+    except ImportError as reason:
+        raise error(f"reading {path} needs safetensors; install hvs-suite[learn]") from reason
+    size = check_regular(path, error=error, within=within, most=most)
+    try:
+        with path.open("rb") as file:
+            length = int.from_bytes(file.read(8), "little")
+        if not 0 < length <= min(_MOST_HEADER_BYTES, size - 8):
+            raise error(f"{path}: is no safetensors file; its header would take {length:,} bytes")
+        with safe_open(path, framework="np") as tensors:
+            return {
+                name: tuple(tensors.get_slice(name).get_shape())
+                for name in tensors.keys()  # noqa: SIM118 - not a dict
+            }
+    except (OSError, ValueError, SafetensorError) as reason:
+        if isinstance(reason, HvsError):
+            raise
+        raise error(f"{path}: is no safetensors file ({_why(reason)})") from reason

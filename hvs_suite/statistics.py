@@ -53,13 +53,15 @@ def wilson_interval(n_success: int, n_total: int, confidence: float = 0.95) -> t
 
 
 def mean_rate_interval(
-    counts: Sequence[tuple[int, int]], confidence: float = 0.95
+    counts: Sequence[tuple[int, int]],
+    confidence: float = 0.95,
+    weights: Sequence[float] | None = None,
 ) -> tuple[float, float]:
-    """Returns an interval for the unweighted mean of independent success rates.
+    """Returns an interval for a weighted mean of independent success rates.
 
-    With rates p_i and their Wilson intervals [l_i, u_i], the k rates' mean m has the interval
-    ``m - sqrt(sum (p_i - l_i)^2) / k`` to ``m + sqrt(sum (u_i - p_i)^2) / k``. One rate has its
-    Wilson interval.
+    With rates p_i, weights w_i and the rates' Wilson intervals [l_i, u_i], their mean
+    m = sum w_i p_i has the interval ``m - sqrt(sum w_i^2 (p_i - l_i)^2)`` to
+    ``m + sqrt(sum w_i^2 (u_i - p_i)^2)``. One rate has its Wilson interval.
 
     Source: G. Y. Zou, W. Huang and X. Zhang, "A note on confidence interval estimation for a linear
     function of binomial proportions", Computational Statistics & Data Analysis 53 (2009) 1080-1085.
@@ -67,6 +69,8 @@ def mean_rate_interval(
     Args:
         counts: Successes and trials of each rate, one or more.
         confidence: Coverage aimed at, in (0, 1).
+        weights: One for each rate; 1 / k by default. Less than 1 in all where rates that are
+            missing count as 0 %.
 
     Returns:
         Lower and upper end (percent).
@@ -79,10 +83,12 @@ def mean_rate_interval(
         raise ValueError("Give one or more rates.")
     rates = [100 * n_success / n_total for n_success, n_total in counts]
     intervals = [wilson_interval(*count, confidence) for count in counts]
-    mean = math.fsum(rates) / len(rates)
-    below = math.hypot(*(p - low for p, (low, _) in zip(rates, intervals, strict=True)))
-    above = math.hypot(*(high - p for p, (_, high) in zip(rates, intervals, strict=True)))
-    return max(0.0, mean - below / len(rates)), min(100.0, mean + above / len(rates))
+    shares = [1.0 / len(rates)] * len(rates) if weights is None else list(weights)
+    weighed = list(zip(shares, rates, intervals, strict=True))
+    mean = math.fsum(w * p for w, p, _ in weighed)
+    below = math.hypot(*(w * (p - low) for w, p, (low, _) in weighed))
+    above = math.hypot(*(w * (high - p) for w, p, (_, high) in weighed))
+    return max(0.0, mean - below), min(100.0, mean + above)
 
 
 def interquartile_mean(values: npt.ArrayLike) -> float:

@@ -10,18 +10,15 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from hvs_suite.errors import PolicyError
+from hvs_suite.errors import PolicyError, first_line
 from hvs_suite.files import replacing
+from hvs_suite.policies.checkpoint_files import FILES, read_config
 from hvs_suite.policies.training_plot import PICTURE
+from hvs_suite.registry import find
+from hvs_suite.tasks.shared.goal import POSITION
 
 CARD = "README.md"
 LICENCE = "apache-2.0"
-CHECKPOINT_FILES = (
-    "config.json",
-    "model.safetensors",
-    "policy_preprocessor.json",
-    "policy_postprocessor.json",
-)
 TRAINING_FILES = ("train_config.json", "training/outcome.json", f"training/{PICTURE}")
 
 
@@ -40,11 +37,15 @@ def write_card(folder: Path, results: Iterable[Mapping[str, Any]] = (), command:
         PolicyError: The folder holds no checkpoint of either.
         OutputError: It cannot be written.
     """
-    config, trained, outcome = (
-        _read(folder / name) for name in ("config.json", *TRAINING_FILES[:2])
-    )
-    body = describe(config, trained, outcome, list(results), command)
-    task = trained["settings"]["task"]
+    config = read_config(folder)
+    trained, outcome = (_read(folder / name) for name in TRAINING_FILES[:2])
+    try:
+        body = describe(config, trained, outcome, list(results), command)
+        task = trained["settings"]["task"]
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise PolicyError(
+            f"{folder} holds no finished training run: its notes lack {first_line(error)}"
+        ) from error
     with replacing(folder / CARD) as temporary:
         temporary.write_text(_front_matter(task) + body, encoding="utf-8")
     return body
@@ -58,13 +59,14 @@ def ship(checkpoint: Path, folder: Path) -> None:
         folder: Gets the files; those of the same names are replaced.
 
     Raises:
-        PolicyError: The run is not finished.
+        PolicyError: The run is not finished, or `read_config` refuses its checkpoint.
         OutputError: The folder cannot be written.
     """
-    for name in (*CHECKPOINT_FILES, *TRAINING_FILES):
+    for name in (*FILES, *TRAINING_FILES):
         if not (checkpoint / name).is_file():
             raise PolicyError(f"{checkpoint} lacks {name}; let its training come to its end first")
-    for name in (*CHECKPOINT_FILES, *TRAINING_FILES):
+    read_config(checkpoint)
+    for name in (*FILES, *TRAINING_FILES):
         with replacing(folder / name) as temporary:
             shutil.copyfile(checkpoint / name, temporary)
 
@@ -91,8 +93,16 @@ def describe(
         f"`{key}` {' x '.join(map(str, value['shape']))}"
         for key, value in sorted(config["input_features"].items())
     )
+    # Fine-tuning has options of its own; of training, the configuration keeps them.
+    options = settings.get("options", config.get("options", {}))
+    spec = find(settings["task"]).with_options(options)
+    words = spec.describe()
+    named = f"`{settings['task']}`"
+    if options:
+        named += " with " + ", ".join(f"`{k}={v!r}`" for k, v in sorted(options.items()))
     rows = {
-        "trained on": f"`{settings['task']}`, split `train` alone",
+        "trained on": f"{named}, split `train` alone",
+        "task": f"{spec.instruction()} Target: {words.target}; within {words.tolerance}",
         "inputs": inputs,
         "output": "`action` 7: joint position targets in units of the joint range",
         **(_rl_rows if was_fine_tuned else _imitation_rows)(settings, outcome),
@@ -104,7 +114,7 @@ def describe(
         f"# hvs policy for {settings['task']}",
         "",
         "Two camera images and the joints in, seven joint position targets out: a LeRobot policy "
-        "of type `hvs` that brings the flange of a simulated KUKA LBR iiwa 7 over a disc.",
+        "of type `hvs` that brings the flange of a simulated KUKA LBR iiwa 7 to its target.",
         "",
         f"![Losses and rounds of the training](training/{PICTURE})",
         "",
@@ -117,9 +127,10 @@ def describe(
     if command:
         lines += ["Made by:", "", "```sh", command, "```", ""]
     lines += [
-        "Limits: it knows this cell alone (the robot, the cameras' nominal places, one disc on a "
-        "level surface) and was never on a real robot. Outside of the ring of targets that the "
-        "task draws from, anything may happen.",
+        "Limits: it knows this cell alone (the robot, the cameras' nominal places) and the task "
+        "that it was trained on, with those options, at control steps of "
+        f"{spec.control_period_s:g} s, and was never on a real robot. Outside of the ring of "
+        "targets that the task draws from, anything may happen.",
         "",
     ]
     return "\n".join(lines)
@@ -185,11 +196,13 @@ def _results(results: list[Mapping[str, Any]]) -> list[str]:
         summary = result["summary"]
         low, high = summary["pc_success_ci95"]
         steps = summary["steps_to_goal_mean"]
+        # Where every episode ends with the task, nothing settles.
+        settled = summary["settled_errors"].get(POSITION)
         lines.append(
             f"| `{summary['task']}` | `{summary['split']}` | {summary['n_success']:,} of "
             f"{summary['n_episodes']:,} ({summary['pc_success']:.1f} %) | {low:.1f} to {high:.1f} "
             f"% | {summary['n_collision']} | {'-' if steps is None else f'{steps:.1f}'} | "
-            f"{summary['settled_position_error_mm']['iqm']:.3f} |"
+            f"{'-' if settled is None else format(settled['iqm'], '.3f')} |"
         )
     return [*lines, ""]
 

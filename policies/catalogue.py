@@ -101,12 +101,12 @@ def _builtin(name: str) -> PolicyFactory:
 def _checkpoint(folder: Path, task: str) -> PolicyFactory:
     """Check a checkpoint here and now, before workers are started for it."""
     try:
-        from hvs_suite.policies import checkpoint
+        from hvs_suite.policies import checkpoint, checkpoint_files
         from hvs_suite.policies.sac import playing
     except ImportError as error:
         raise PolicyError(f"playing {folder} needs torch; install hvs-suite[learn]") from error
     if playing.is_sac(folder):
         playing.check_fit(playing.read_config(folder), folder, find(task))
         return playing.SacFactory(str(folder.resolve()))
-    checkpoint.check_fit(checkpoint.read_config(folder), folder, find(task))
+    checkpoint.check_fit(checkpoint_files.read_config(folder), folder, find(task))
     return checkpoint.CheckpointFactory(str(folder.resolve()))

@@ -7,25 +7,39 @@ that both ways give the same action. Anything else goes through LeRobot.
 
 import dataclasses
 import hashlib
-import json
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
+import pydantic
 import torch
 from torch import Tensor
 
-from hvs_suite.errors import PolicyError
+from hvs_suite.errors import PolicyError, first_line
+from hvs_suite.policies.checkpoint_files import (
+    MOST_SIZE,
+    POSTPROCESSOR,
+    PREPROCESSOR,
+    WEIGHTS,
+    Size,
+    check_sizes,
+    check_weights,
+    read_config,
+    read_settings,
+    read_steps,
+)
 from hvs_suite.policies.hvs.compiled import CompiledNetwork
 from hvs_suite.policies.hvs.network import (
     IMAGE_PREFIX,
     N_JOINTS,
+    RESIDUAL_BOUND,
     STATE,
     HvsNetwork,
     shape_from_config,
 )
+from hvs_suite.policies.trained_for import check_trained_for
 from hvs_suite.rollout import Observation, one_torch_thread
 from hvs_suite.tasks.shared.spec import Spec, observation_names
 
@@ -35,13 +49,13 @@ Decide = Callable[[dict[str, Tensor]], Tensor]
 # Where the network's own keys live in a checkpoint of the LeRobot policy around it.
 NETWORK_PREFIX = "network."
 STANDARD_STEPS = {
-    "policy_preprocessor.json": (
+    PREPROCESSOR: (
         "rename_observations_processor",
         "to_batch_processor",
         "device_processor",
         "normalizer_processor",
     ),
-    "policy_postprocessor.json": ("unnormalizer_processor", "device_processor"),
+    POSTPROCESSOR: ("unnormalizer_processor", "device_processor"),
 }
 
 
@@ -158,32 +172,10 @@ def _one(
     return images, batch[STATE][None] if network.shape.state_dim else None
 
 
-def read_config(folder: Path) -> dict[str, Any]:
-    """Read a checkpoint's ``config.json``.
-
-    Args:
-        folder: The checkpoint.
-
-    Returns:
-        The parsed file.
-
-    Raises:
-        PolicyError: The folder is not a checkpoint.
-    """
-    for name in ("config.json", "model.safetensors", *STANDARD_STEPS):
-        if not (folder / name).is_file():
-            raise PolicyError(f"{folder} is not a LeRobot checkpoint: it has no {name}")
-    try:
-        config = json.loads((folder / "config.json").read_text())
-    except (OSError, ValueError) as error:
-        raise PolicyError(f"{folder}/config.json cannot be read: {error}") from error
-    if not isinstance(config, dict) or not isinstance(config.get("input_features"), dict):
-        raise PolicyError(f"{folder}/config.json names no input_features")
-    return config
-
-
 def check_fit(config: Mapping[str, Any], folder: Path, spec: Spec) -> None:
     """Check that a task shows what a checkpoint reads, in the same size, and takes its actions.
+
+    One of type `hvs` also has to be trained for such tasks; see `check_trained_for`.
 
     Args:
         config: Of the checkpoint.
@@ -193,6 +185,8 @@ def check_fit(config: Mapping[str, Any], folder: Path, spec: Spec) -> None:
     Raises:
         PolicyError: It does not fit.
     """
+    if config.get("type") == "hvs":
+        check_trained_for(config, folder, spec)
     shown = observation_names(spec.observations)
     mismatch = f"{folder} does not fit {spec.name}: "
     if spec.action_mode != "joint_position" or spec.normalise_observation:
@@ -228,19 +222,29 @@ def _size(shape: tuple[int, ...]) -> str:
 def _processors_are_standard(folder: Path) -> bool:
     """Whether the processors do nothing but add a batch dimension."""
     for name, expected in STANDARD_STEPS.items():
-        try:
-            steps = json.loads((folder / name).read_text())["steps"]
-            if tuple(step["registry_name"] for step in steps) != expected:
-                return False
-        except (OSError, ValueError, KeyError, TypeError):
+        steps = read_steps(folder, name)
+        if tuple(step.registry_name for step in steps) != expected:
             return False
         for step in steps:
-            settings = step.get("config", {})
-            if settings.get("rename_map"):
+            modes = step.config.get("norm_map", {})
+            if step.config.get("rename_map") or not isinstance(modes, dict):
                 return False
-            if any(mode != "IDENTITY" for mode in settings.get("norm_map", {}).values()):
+            if any(mode != "IDENTITY" for mode in modes.values()):
                 return False
     return True
+
+
+class _Sizes(pydantic.BaseModel):
+    """What decides the size of an `hvs` network."""
+
+    model_config = pydantic.ConfigDict(extra="allow")
+
+    channels: Annotated[Size, pydantic.Field(ge=4)]
+    hidden: Annotated[Size, pydantic.Field(ge=4)]
+    error_scale: Annotated[float, pydantic.Field(gt=0.0, allow_inf_nan=False)]
+    residual_hidden: Annotated[int, pydantic.Field(strict=True, ge=0, le=MOST_SIZE)] = 0
+    residual_bound: Annotated[float, pydantic.Field(gt=0.0, allow_inf_nan=False)] = RESIDUAL_BOUND
+    from_set_point: Annotated[bool, pydantic.Field(strict=True)] = False
 
 
 def load_network(folder: Path, config: Mapping[str, Any]) -> HvsNetwork:
@@ -248,7 +252,7 @@ def load_network(folder: Path, config: Mapping[str, Any]) -> HvsNetwork:
 
     Args:
         folder: The checkpoint.
-        config: Its ``config.json``, parsed.
+        config: Its ``config.json``, as `read_config` returns it.
 
     Raises:
         PolicyError: It cannot be loaded.
@@ -256,13 +260,16 @@ def load_network(folder: Path, config: Mapping[str, Any]) -> HvsNetwork:
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
+    read_settings(_Sizes, folder)
+    check_weights(folder, lambda: HvsNetwork(shape_from_config(config)), NETWORK_PREFIX)
     try:
         network = HvsNetwork(shape_from_config(config))
-        weights = load_file(folder / "model.safetensors")
+        weights = load_file(folder / WEIGHTS)
         network.load_state_dict({k.removeprefix(NETWORK_PREFIX): v for k, v in weights.items()})
-    except (SafetensorError, OSError, KeyError, ValueError, RuntimeError) as error:
-        reason = str(error).splitlines()[0]
-        raise PolicyError(f"{folder} cannot be loaded as an hvs policy: {reason}") from error
+    except (SafetensorError, OSError, RuntimeError) as error:
+        raise PolicyError(
+            f"{folder} cannot be loaded as an hvs policy: {first_line(error)}"
+        ) from error
     return network.eval()
 
 
@@ -273,12 +280,11 @@ def weights_digest(folder: Path) -> str:
         folder: The checkpoint.
 
     Raises:
-        PolicyError: It has none.
+        PolicyError: It is no checkpoint, see `read_config`.
     """
-    try:
-        return hashlib.sha256((folder / "model.safetensors").read_bytes()).hexdigest()
-    except OSError as error:
-        raise PolicyError(f"{folder} holds no model.safetensors that can be read") from error
+    read_config(folder)
+    with (folder / WEIGHTS).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _network(folder: Path, config: Mapping[str, Any]) -> tuple[Decide, Callable[[], None]]:
@@ -319,17 +325,22 @@ def _lerobot(folder: Path, instruction: str) -> tuple[Decide, Callable[[], None]
     try:
         config = PreTrainedConfig.from_pretrained(folder, local_files_only=True)
         config.device = "cpu"
-        policy = get_policy_class(config.type).from_pretrained(
-            folder, config=config, local_files_only=True
-        )
+        if hasattr(config, "pretrained_backbone_weights"):
+            # Where training began; fetched, although the checkpoint's own weights replace them.
+            config.pretrained_backbone_weights = None
+        check_sizes(folder, vars(config))
+        policy_class = get_policy_class(config.type)
+        check_weights(folder, lambda: policy_class(config))
+        policy = policy_class.from_pretrained(folder, config=config, local_files_only=True)
         before, after = make_pre_post_processors(
             config,
             pretrained_path=str(folder),
             preprocessor_overrides={"device_processor": {"device": "cpu"}},
         )
+    except PolicyError:
+        raise
     except Exception as error:  # LeRobot and what it loads raise anything
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise PolicyError(f"LeRobot cannot load {folder}: {reason}") from error
+        raise PolicyError(f"LeRobot cannot load {folder}: {first_line(error)}") from error
 
     def decide(batch: dict[str, Tensor]) -> Tensor:
         action: Tensor = after(policy.select_action(before({**batch, "task": instruction})))

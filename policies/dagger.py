@@ -23,7 +23,7 @@ from hvs_suite.datasets.recorder import in_order
 from hvs_suite.errors import OutputError
 from hvs_suite.policies.checkpoint import CheckpointFactory
 from hvs_suite.policies.demonstrations import Manifest, Recording
-from hvs_suite.policies.frame_cache import open_frames
+from hvs_suite.policies.frame_cache import new_frames, open_frames
 from hvs_suite.policies.hvs.network import IMAGE_PREFIX
 from hvs_suite.rollout import Policy, play
 
@@ -222,7 +222,6 @@ class _Store:
     """Frames on disk: images memory-mapped, numbers in memory until the end."""
 
     def __init__(self, folder: Path, keys: Mapping[str, Mapping[str, Any]], frames: int) -> None:
-        open_memmap: Any = np.lib.format.open_memmap  # untyped in NumPy's stubs
         self._folder = folder
         self._frames = frames
         self._filled = 0
@@ -232,8 +231,7 @@ class _Store:
         for key, feature in keys.items():
             shape = (frames, *feature["shape"])
             if key.startswith(IMAGE_PREFIX):
-                path = folder / f"{key}.npy"
-                self._images[key] = open_memmap(path, mode="w+", dtype=np.uint8, shape=shape)
+                self._images[key] = new_frames(folder / f"{key}.npy", shape)
             else:
                 self._columns[key] = np.zeros(shape, np.float32)
 

@@ -384,7 +384,14 @@ def _read_columns(manifest: Manifest) -> dict[str, Column]:
                 declared = tuple(manifest.features[key]["shape"])
                 if values.shape[1:] != declared:
                     raise DatasetError(f"{key} has shape {values.shape[1:]}, not {declared}")
-                parts[key].append(values.astype(np.float32))
+                values = values.astype(np.float32)
+                astray = np.flatnonzero(~np.isfinite(values).all(axis=tuple(range(1, values.ndim))))
+                if len(astray):
+                    raise DatasetError(
+                        f"{key} holds NaN or infinity in {len(astray)} rows, row {astray[0]} "
+                        "first; record the dataset again"
+                    )
+                parts[key].append(values)
             index = reader.column(table, EPISODE)
             if index.ndim != 1:
                 raise DatasetError(f"{EPISODE}: a row holds no number")

@@ -8,7 +8,8 @@ import contextlib
 import hashlib
 import json
 import mmap
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.datasets import reader
-from hvs_suite.errors import DatasetError
+from hvs_suite.errors import DatasetError, OutputError
 from hvs_suite.files import replacing
 
 Frames = npt.NDArray[np.uint8]
@@ -74,6 +75,7 @@ def cached_frames(
 
     Raises:
         DatasetError: A frame is missing, cannot be decoded, or has another size.
+        OutputError: The cache cannot be written, or the disk has no room for it.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{key}.npy"
@@ -84,8 +86,7 @@ def cached_frames(
         if json.loads(made_from.read_text()) == stamp:
             return open_frames(path)
     made_from.unlink(missing_ok=True)
-    open_memmap: Any = np.lib.format.open_memmap  # untyped in NumPy's stubs
-    frames = open_memmap(path, mode="w+", dtype=np.uint8, shape=(n_frames, *shape))
+    frames: Any = new_frames(path, (n_frames, *shape))
     done = 0
     for stored in _stored(root, key):
         if done >= n_frames:
@@ -106,6 +107,37 @@ def cached_frames(
     if on_frames is not None and done % ROWS_AT_ONCE:
         on_frames(done % ROWS_AT_ONCE)
     return open_frames(path)
+
+
+def new_frames(path: Path, shape: Sequence[int]) -> Frames:
+    """Make an array file of frames, all its room on the disk taken at once.
+
+    Without that, the first frame for which no room is left would end the process (SIGBUS).
+
+    Args:
+        path: The file; replaced if it is there.
+        shape: (n, H, W, C).
+
+    Returns:
+        Zeros of that shape, uint8, memory-mapped; `flush` them in the end.
+
+    Raises:
+        OutputError: It cannot be written, or the disk has no room for it.
+    """
+    open_memmap: Any = np.lib.format.open_memmap  # untyped in NumPy's stubs
+    try:
+        frames: Frames = open_memmap(path, mode="w+", dtype=np.uint8, shape=tuple(shape))
+        # macOS has no such call.
+        if hasattr(os, "posix_fallocate"):
+            with path.open("r+b") as file:
+                os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
+    except OSError as error:
+        path.unlink(missing_ok=True)
+        size = int(np.prod(shape, dtype=np.int64)) / 1e6
+        raise OutputError(
+            f"cannot write {path}: {error.strerror or error}; it takes {size:.1f} MB"
+        ) from error
+    return frames
 
 
 def open_frames(path: Path) -> Frames:

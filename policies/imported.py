@@ -39,7 +39,8 @@ class ImportedFactory:
         """Imports the module, which runs its code, and builds the policy for an environment.
 
         Raises:
-            PolicyError: The module cannot be imported, or what it makes is no policy.
+            PolicyError: The module cannot be imported, its factory raises, or what it makes is no
+                policy.
         """
         name = f"{self.module}:{self.factory}"
         make = self._callable()

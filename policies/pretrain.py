@@ -9,18 +9,19 @@ import dataclasses
 import json
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from hvs_suite.errors import OptionError
+from hvs_suite.errors import OptionError, PolicyError
 from hvs_suite.files import replacing
 from hvs_suite.policies.allocator import keep_freed_memory
 from hvs_suite.policies.checkpoint import weights_digest
+from hvs_suite.policies.curves import Curves
 from hvs_suite.policies.dagger import RoundSummary, play_round, read_round, round_shares
 from hvs_suite.policies.demonstrations import (
     Demonstrations,
@@ -159,8 +160,9 @@ def pretrain(
     Raises:
         DatasetError: The dataset cannot be trained on, or was recorded on ``test``.
         OptionError: No budget, or a number that makes no sense.
-        OutputError: ``out`` cannot be written, or holds something else than this run.
-        PolicyError: The eyes do not fit.
+        OutputError: ``out`` cannot be written, its disk is full, or it holds something else than
+            this run. With room again, the same command goes on from the last checkpoint.
+        PolicyError: The eyes do not fit, or the loss is no number any more.
     """
     _check_budget(minutes, steps)
     if workers < 1:
@@ -198,6 +200,7 @@ def pretrain(
             {"minutes": minutes, "steps": steps},
             PACKAGES,
             data=str(data),
+            options=dict(manifest.options),
             policy={
                 "type": "hvs",
                 "channels": policy.config.channels,
@@ -294,8 +297,6 @@ class _Run:
         checkpoint_period_s: float,
     ) -> None:
         """Train until the budget is used up; the last checkpoint is the final one."""
-        from torch.utils.tensorboard import SummaryWriter
-
         state = self._out / "training" / "state.safetensors"
         rate, batch_size = settings.learning_rate, settings.batch_size
         decay = policy.config.optimizer_weight_decay
@@ -311,14 +312,12 @@ class _Run:
         started = last_checkpoint = time.perf_counter()
         recent: list[float] = []
         policy.train()
-        writer = SummaryWriter(
-            str(self._out / "training" / "tensorboard"), purge_step=self._counters.step
-        )
+        curves = Curves(self._out / "training" / "tensorboard", self._counters.step)
         try:
             while (share := budget.share(self._counters)) < 1.0:
                 if len(self._rounds) < len(due) and share >= due[len(self._rounds)]:
                     paused = time.perf_counter()
-                    self._checkpoint(policy, optimizer, demonstrations, state, writer)
+                    self._checkpoint(policy, optimizer, demonstrations, state, curves)
                     self._play_round(demonstrations, rounds)
                     order = _Order(demonstrations.training, batch_size, settings.seed)
                     pause = time.perf_counter() - paused
@@ -338,7 +337,14 @@ class _Run:
                     loss = loss + extra
                 optimizer.zero_grad()
                 loss.backward()  # type: ignore[no-untyped-call]
-                torch.nn.utils.clip_grad_norm_(policy.parameters(), GRADIENT_NORM)
+                norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), GRADIENT_NORM)
+                # Before the step: a weight that is no number would spread through all the others.
+                if not math.isfinite(loss.item()) or not math.isfinite(norm.item()):
+                    raise PolicyError(
+                        f"training came apart at step {step + 1} (loss {loss.item()}, gradient "
+                        f"{norm.item()}); {self._out} keeps its last checkpoint; train anew on "
+                        "other data, or with a lower learning rate"
+                    )
                 optimizer.step()
 
                 recent = [*recent[1 - LOG_EVERY_STEPS :], loss.item()]
@@ -348,15 +354,19 @@ class _Run:
                 self._sitting_s = now - started
                 self._counters = Counters(step + 1, before_s + self._sitting_s)
                 if self._counters.step % LOG_EVERY_STEPS == 0:
-                    _log(writer, self._counters.step, {"loss": self._loss, **parts})
-                    writer.add_scalar("learning_rate", group["lr"], self._counters.step)
+                    figures = {"loss": self._loss, **parts}
+                    curves.add(
+                        {"learning_rate": group["lr"]}
+                        | {f"train/{name}": value for name, value in figures.items()},
+                        self._counters.step,
+                    )
                 if now - last_checkpoint >= checkpoint_period_s:
-                    self._checkpoint(policy, optimizer, demonstrations, state, writer)
+                    self._checkpoint(policy, optimizer, demonstrations, state, curves)
                     last_checkpoint = time.perf_counter()
                 self._report_training(budget.share(self._counters), begun)
-            self._checkpoint(policy, optimizer, demonstrations, state, writer)
+            self._checkpoint(policy, optimizer, demonstrations, state, curves)
         finally:
-            writer.close()
+            curves.close()
 
     def outcome(self, policy: "HvsPolicy") -> Outcome:
         """What the sitting came to."""
@@ -404,13 +414,13 @@ class _Run:
         optimizer: torch.optim.Optimizer,
         demonstrations: Demonstrations,
         state: Path,
-        writer: Any,
+        curves: Curves,
     ) -> None:
         from hvs_suite.policies.hvs.modeling_hvs import save_checkpoint
 
         parts = _held_out(policy, demonstrations)
         self._held_out_loss = parts.get("loss", math.nan)
-        _log(writer, self._counters.step, {f"held_out/{name}": v for name, v in parts.items()})
+        curves.add({f"held_out/{name}": v for name, v in parts.items()}, self._counters.step)
         save_state(state, policy, optimizer, self._counters)
         save_checkpoint(policy, self._out)
 
@@ -528,8 +538,3 @@ def _check_budget(minutes: float | None, steps: int | None) -> None:
     for name, value in (("minutes", minutes), ("steps", steps)):
         if value is not None and not (value > 0 and math.isfinite(value)):
             raise OptionError(f"{name} must be above 0, not {value}")
-
-
-def _log(writer: Any, step: int, values: Mapping[str, float]) -> None:
-    for name, value in values.items():
-        writer.add_scalar(name if "/" in name else f"train/{name}", value, step)

@@ -10,9 +10,11 @@ from torch import nn
 
 from hvs_suite.datasets.features import ACTION_EXECUTED
 from hvs_suite.errors import OptionError, PolicyError
-from hvs_suite.policies.checkpoint import load_network, read_config
+from hvs_suite.policies.checkpoint import load_network
+from hvs_suite.policies.checkpoint_files import read_config
 from hvs_suite.policies.demonstrations import Manifest, calibration_of
 from hvs_suite.policies.hvs.network import IMAGE_PREFIX, STATE, Eye
+from hvs_suite.policies.trained_for import trained_for
 from hvs_suite.registry import find
 
 if TYPE_CHECKING:
@@ -128,6 +130,7 @@ def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":
         keypoint_weight=settings.keypoint_weight,
         error_scale=settings.error_scale,
         from_set_point=STATE in inputs and trails_its_set_point(manifest),
+        **trained_for(find(manifest.task).with_options(manifest.options)).model_dump(),
     )
     # torch initialises weights from its global generator; leave that as it was found.
     with torch.random.fork_rng(devices=[]):

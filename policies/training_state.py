@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from hvs_suite.errors import OutputError
@@ -49,7 +49,8 @@ def save_state(
             tensors[f"{MOMENT}{index}.{name}"] = value.contiguous()
     metadata = {"step": str(counters.step), "elapsed_s": repr(counters.elapsed_s)}
     with replacing(path) as temporary:
-        save_file(tensors, temporary, metadata)
+        # Its `save_file` hides that the disk is full behind an error of its own.
+        temporary.write_bytes(save(tensors, metadata))
 
 
 def load_state(path: Path, model: nn.Module, optimizer: torch.optim.Optimizer) -> Counters:

@@ -53,9 +53,12 @@ class TrackSpec(PlacingSpec):
     """
 
     family: ClassVar[str] = "track"
+    headline: ClassVar[tuple[str, ...]] = (RMS_POSITION, TIME_INSIDE)
     further_privileged: ClassVar[Mapping[str, tuple[str, ...]]] = {"goal_velocity": ("x", "y", "z")}
     plays_on: ClassVar[bool] = False
 
+    # Farther out the arm is nearly stretched, and following takes most of the joints' speed.
+    ring_m: tuple[float, float] = scene((0.42, 0.74))
     motion: Literal["line", "curve"] = scene("line")
     speed_m_s: tuple[float, float] = scene((0.05, 0.15))
     acceleration_m_s2: float = scene(0.3)
@@ -287,7 +290,11 @@ class Track(Placing[TrackSpec, TrackScenario]):
         ]
 
 
-_LINE = TrackSpec(name="track-line")
+_LINE = TrackSpec(
+    name="track-line",
+    # The arm may half cover a target: at 112 px two pixels would be left of it.
+    eth_resolution=168,
+)
 
 register(
     Track,

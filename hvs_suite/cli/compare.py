@@ -44,8 +44,11 @@ class Compare:
                 ("by neither", str(found.n_neither)),
                 ("p, exact McNemar", f"{found.p:.2g}"),
                 *_row("success, percentage points", found.success),
-                *_row("settled position error, mm", found.settled_position_mm),
-                *_row("settled tilt error, deg", found.settled_tilt_deg),
+                *(
+                    row
+                    for name, difference in found.settled.items()
+                    for row in _row(f"{name} at the end", difference)
+                ),
                 *_row("steps to goal, where both succeed", found.steps_to_goal),
             ],
             title=f"A = {found.a}, B = {found.b}; differences are A minus B with 95 % intervals",

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from hvs_suite.eval.contender import Contender
     from hvs_suite.eval.result_file import Result
     from hvs_suite.eval.trial import Trial
+    from hvs_suite.tasks.shared.metric import Metric
 
 # The first few say what is wrong; a thousand of the same hide it.
 MAX_COMPLAINTS = 3
@@ -110,10 +111,13 @@ class Evaluate:
 
 def _print_summary(result: "Result") -> None:
     """Print the numbers of a result as a table."""
+    from hvs_suite.registry import find
+
     summary = result.summary
     low, high = summary.pc_success_ci95
     to_goal = summary.steps_to_goal_mean
-    settled, sharpest = summary.settled_position_error_mm, summary.settled_sharpest_95.scale
+    spec, errors, settled = find(summary.task), summary.errors, summary.settled
+    sharpest = settled.sharpest_95.scale
     console.print_table(
         ("", "value"),
         [
@@ -128,19 +132,18 @@ def _print_summary(result: "Result") -> None:
             ("steps to goal, mean", "-" if to_goal is None else f"{to_goal:.1f}"),
             *(
                 (
-                    f"{name.replace('_', ' ')}, {unit}: p50, p95",
-                    f"{errors.p50:.3f}, {errors.p95:.3f}",
+                    f"{_title(metric)}: p50, p95",
+                    f"{errors[metric.name].p50:.3f}, {errors[metric.name].p95:.3f}",
                 )
-                for name, unit, errors in (
-                    ("position_error", "mm", summary.position_error_mm),
-                    ("lateral_error", "mm", summary.lateral_error_mm),
-                    ("height_error", "mm", summary.height_error_mm),
-                    ("tilt_error", "deg", summary.tilt_error_deg),
-                )
+                for metric in spec.metrics
             ),
-            (
-                "settled position error, mm: iqm, p99",
-                f"{settled.iqm:.3f}, {settled.p99:.3f}",
+            *(
+                (
+                    f"settled {_title(metric)}: iqm, p99",
+                    f"{settled.errors[metric.name].iqm:.3f}, {settled.errors[metric.name].p99:.3f}",
+                )
+                for metric in spec.metrics
+                if spec.plays_on and metric.name in spec.headline
             ),
             (
                 "sharpest tolerance met in 95 %",
@@ -150,3 +153,7 @@ def _print_summary(result: "Result") -> None:
         ],
         title=f"{summary.policy} on {summary.task}, split {summary.split}",
     )
+
+
+def _title(metric: "Metric") -> str:
+    return f"{metric.title}, {metric.unit}" if metric.unit else metric.title

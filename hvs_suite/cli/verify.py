@@ -1,6 +1,7 @@
 """``hvs verify``: play a result's logged actions again and recompute its numbers."""
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -63,8 +64,7 @@ class Verify:
                     print(
                         f"{shown(str(path))}: as it says; {verdict.n_played} of "
                         f"{verdict.n_episodes} scenarios played again{drawn}, {verdict.n_near} "
-                        f"decided by rounding, largest difference {verdict.largest_mm:.1e} mm and "
-                        f"{verdict.largest_deg:.1e} deg"
+                        f"decided by rounding, largest difference {_largest(verdict.largest)}"
                     )
         except (ResultError, UnknownTaskError) as error:
             from hvs_suite.cli.main import complain
@@ -74,3 +74,8 @@ class Verify:
         if self.json:
             console.print_json(found)
         return 0
+
+
+def _largest(largest: Mapping[str, float]) -> str:
+    """Largest differences by unit, such as ``0.0e+00 mm, 0.0e+00 deg``."""
+    return ", ".join(f"{value:.1e} {unit}" for unit, value in largest.items())

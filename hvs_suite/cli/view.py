@@ -47,8 +47,9 @@ class View:
         if self.out is not None:
             pictures.check_film_suffix(self.out)
             check_writable(self.out)
+        make = policy_factory(self.policy, self.task)
         with hvs_suite.load(self.task, split=self.split) as env:
-            policy = policy_factory(self.policy, self.task)(env)
+            policy = make(env)
             if self.out is None:
                 episode = play_in_window(env, policy, self.scenario)
             else:
@@ -73,9 +74,8 @@ def describe(episode: "Episode", policy: str) -> str:
         how = f"collision in step {episode.steps}"
     else:
         how = f"time is up after {episode.steps} steps"
-    return f"{policy}, scenario {episode.scenario}: {how}; , ".join(
-        f"{name} {value:.2f}" for name, value in episode.errors.items()
-    )
+    errors = ", ".join(f"{name} {value:.2f}" for name, value in episode.errors.items())
+    return f"{policy}, scenario {episode.scenario}: {how}; {errors}"
 
 
 def play_in_window(env: "Environment", policy: "Policy", scenario: int) -> "Episode":

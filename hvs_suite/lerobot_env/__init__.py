@@ -1,6 +1,7 @@
 r"""The named tasks as a LeRobot environment: ``--env.type=hvs``.
 
-    lerobot-eval --env.discover_packages_path=hvs_suite.lerobot_env --env.type=hvs \
+    OMP_NUM_THREADS=1 lerobot-eval \
+        --env.discover_packages_path=hvs_suite.lerobot_env --env.type=hvs \
         --env.task=align-thesis --policy.path=DIR
 
 Importing this package registers the type, and that of the suite's own policy with it: LeRobot does

@@ -5,11 +5,12 @@ import json
 import shutil
 from pathlib import Path
 
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from hvs_suite.errors import PolicyError
 from hvs_suite.files import replacing
-from hvs_suite.policies.checkpoint import NETWORK_PREFIX, STANDARD_STEPS, load_network, read_config
+from hvs_suite.policies.checkpoint import NETWORK_PREFIX, STANDARD_STEPS, load_network
+from hvs_suite.policies.checkpoint_files import read_config
 from hvs_suite.policies.hvs.network import HvsNetwork
 
 
@@ -56,7 +57,7 @@ def write_folded(base: Path, network: HvsNetwork, out: Path) -> None:
         out: Gets ``config.json``, ``model.safetensors`` and the two processors.
     """
     out.mkdir(parents=True, exist_ok=True)
-    config = json.loads((base / "config.json").read_text())
+    config = read_config(base)
     config["residual_hidden"] = network.shape.residual_hidden
     config["residual_bound"] = network.shape.residual_bound
     weights = {
@@ -68,6 +69,6 @@ def write_folded(base: Path, network: HvsNetwork, out: Path) -> None:
         for path in base.glob(f"{Path(name).stem}*"):
             shutil.copy(path, out / path.name)
     with replacing(out / "model.safetensors") as temporary:
-        save_file(weights, temporary, {"format": "pt"})
+        temporary.write_bytes(save(weights, {"format": "pt"}))
     with replacing(out / "config.json") as temporary:
         temporary.write_text(json.dumps(config, indent=2, sort_keys=True) + "\n")

@@ -26,9 +26,9 @@ from hvs_suite.policies.catalogue import name_of
 from hvs_suite.policies.checkpoint import (
     CheckpointPolicy,
     check_fit,
-    read_config,
     weights_digest,
 )
+from hvs_suite.policies.checkpoint_files import read_config
 from hvs_suite.policies.finetune.eyes import train_eyes
 from hvs_suite.policies.finetune.folding import load_base, with_residual, write_folded
 from hvs_suite.policies.finetune.meanwhile import Meanwhile, MeanwhileHere, MeanwhileThere

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
@@ -15,6 +16,7 @@ from hvs_suite.policies.hvs.network import (
     RESIDUAL_BOUND,
     Shape,
 )
+from hvs_suite.policies.trained_for import CONTROL_PERIOD_S, FAMILY
 
 CAMERAS = ("eih", "eth")
 
@@ -39,6 +41,10 @@ class HvsConfig(PreTrainedConfig):
         from_set_point: Joint steps are counted from where the arm has been sent, and not from where
             it stands; for a policy that learned with that in its memory, of an arm with latency
             (docs/experiments/from-set-point.md).
+        family: Family of the tasks that it was trained for.
+        control_period_s: Length of their control step (s).
+        options: Options of the task that it was trained with, where they differ from the named one;
+            `hvs_suite.policies.trained_for` holds them against what is to be played.
         keypoint_weight: Weight of the losses against the projected target and its place in space,
             where the dataset has ``privileged.*`` columns; 0 trains on actions alone.
         optimizer_lr: Peak learning rate of stock ``lerobot-train``.
@@ -58,6 +64,9 @@ class HvsConfig(PreTrainedConfig):
     residual_hidden: int = 0
     residual_bound: float = RESIDUAL_BOUND
     from_set_point: bool = False
+    family: str = FAMILY
+    control_period_s: float = CONTROL_PERIOD_S
+    options: dict[str, Any] = field(default_factory=dict)
     keypoint_weight: float = 1.0
     optimizer_lr: float = 2e-3
     optimizer_weight_decay: float = 1e-4

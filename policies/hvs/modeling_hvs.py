@@ -11,6 +11,7 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
+from hvs_suite.errors import OutputError, first_line
 from hvs_suite.policies.hvs.configuration_hvs import HvsConfig
 from hvs_suite.policies.hvs.network import (
     IMAGE_PREFIX,
@@ -231,19 +232,29 @@ def save_checkpoint(policy: HvsPolicy, folder: Path) -> None:
     Args:
         policy: The policy.
         folder: Gets ``config.json``, ``model.safetensors`` and the two processors.
+
+    Raises:
+        OutputError: It cannot be written; what stood there before still does.
     """
     import tempfile
 
+    from safetensors import SafetensorError
+
     from hvs_suite.policies.hvs.processor_hvs import make_hvs_pre_post_processors
 
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder, prefix=".checkpoint-") as name:
-        scratch = Path(name)
-        policy.save_pretrained(scratch)
-        for processor in make_hvs_pre_post_processors(policy.config):
-            processor.save_pretrained(scratch)
-        # LeRobot reads the type before it knows the class; keep the file stable for diffs.
-        config = json.loads((scratch / "config.json").read_text())
-        (scratch / "config.json").write_text(json.dumps(config, indent=2, sort_keys=True) + "\n")
-        for path in sorted(scratch.iterdir()):
-            path.replace(folder / path.name)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".checkpoint-") as name:
+            scratch = Path(name)
+            policy.save_pretrained(scratch)
+            for processor in make_hvs_pre_post_processors(policy.config):
+                processor.save_pretrained(scratch)
+            # LeRobot reads the type before it knows the class; keep the file stable for diffs.
+            config = json.loads((scratch / "config.json").read_text())
+            (scratch / "config.json").write_text(
+                json.dumps(config, indent=2, sort_keys=True) + "\n"
+            )
+            for path in sorted(scratch.iterdir()):
+                path.replace(folder / path.name)
+    except (OSError, SafetensorError) as error:
+        raise OutputError(f"cannot write {folder}: {first_line(error)}") from error

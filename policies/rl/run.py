@@ -18,7 +18,8 @@ from stable_baselines3.common.logger import Logger
 
 from hvs_suite.errors import OptionError
 from hvs_suite.files import replacing
-from hvs_suite.policies.rl.curves import Curves
+from hvs_suite.policies.curves import Curves
+from hvs_suite.policies.rl.curves import LoggedCurves
 from hvs_suite.policies.rl.evaluation import (
     Evaluation,
     Examiner,
@@ -217,8 +218,9 @@ class Run:
         self._evaluations = read_evaluations(
             self._training / "evaluations.json", model.num_timesteps
         )
-        self._curves = Curves(self._training / "tensorboard", model.num_timesteps)
-        model.set_logger(Logger(None, [self._curves]))
+        # Points of a sitting that was killed lie beyond the step of its last checkpoint.
+        self._curves = Curves(self._training / "tensorboard", model.num_timesteps + 1)
+        model.set_logger(Logger(None, [LoggedCurves(self._curves)]))
 
     def close(self) -> None:
         """Close the curves."""

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from stable_baselines3 import SAC, TD3
 from stable_baselines3.common.buffers import DictReplayBuffer
 from torch import Tensor
@@ -72,7 +72,7 @@ def save_run(folder: Path, model: Model, counters: Counters) -> None:
     }
     tensors = {name: value.detach().cpu().contiguous() for name, value in _tensors(model).items()}
     with replacing(folder / STATE) as temporary:
-        save_file(tensors, temporary, {"state": json.dumps(header)})
+        temporary.write_bytes(save(tensors, {"state": json.dumps(header)}))
     _forget_rows(folder / REPLAY, stored, _memory(model).buffer_size)
 
 

@@ -6,17 +6,27 @@ A folder holds ``config.json`` (``"type": "hvs_sac"``), ``model.safetensors`` (t
 
 import dataclasses
 import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
+import pydantic
 import torch
 from gymnasium import spaces
 
-from hvs_suite.errors import PolicyError
+from hvs_suite.errors import PolicyError, first_line
 from hvs_suite.files import replacing
+from hvs_suite.policies.checkpoint_files import (
+    CONFIG,
+    WEIGHTS,
+    Size,
+    check_files,
+    check_weights,
+    read_settings,
+    read_shapes,
+)
+from hvs_suite.policies.trained_for import TrainedFor, check_trained_for, trained_for
 from hvs_suite.rollout import Observation, one_torch_thread
 from hvs_suite.tasks.shared.spec import Spec, observation_names
 
@@ -24,10 +34,50 @@ if TYPE_CHECKING:
     from stable_baselines3.sac.policies import Actor
 
 TYPE = "hvs_sac"
-CONFIG = "config.json"
-WEIGHTS = "model.safetensors"
 
 Action = npt.NDArray[np.float32]
+
+
+class Input(pydantic.BaseModel):
+    """What the actor reads under one name: an image, or joints.
+
+    Attributes:
+        shape: Of an image, (channels, rows, columns).
+        high: Bounds of a joint input; its values lie between these and their negatives.
+    """
+
+    model_config = pydantic.ConfigDict(extra="forbid")
+
+    shape: Annotated[list[Size], pydantic.Field(min_length=3, max_length=3)] | None = None
+    high: (
+        Annotated[
+            list[Annotated[float, pydantic.Field(gt=0.0, allow_inf_nan=False)]],
+            pydantic.Field(min_length=1, max_length=64),
+        ]
+        | None
+    ) = None
+
+    @pydantic.model_validator(mode="after")
+    def _is_one_of_both(self) -> "Input":
+        if (self.shape is None) == (self.high is None):
+            raise ValueError("an input has either a shape or bounds")
+        return self
+
+
+class Config(TrainedFor):
+    """A folder's ``config.json``.
+
+    Attributes:
+        type: Of the policy.
+        action_mode: What the actor commands.
+        inputs: What it reads, by name.
+        hidden: Widths of the dense layers.
+    """
+
+    type: Literal["hvs_sac"]
+    action_mode: str
+    inputs: Annotated[dict[str, Input], pydantic.Field(min_length=1, max_length=8)]
+    hidden: Annotated[list[Size], pydantic.Field(max_length=16)]
 
 
 class Stage(Protocol):
@@ -96,13 +146,16 @@ class SacFactory:
         return GreedyActor(_load_actor(folder, config))
 
 
+class _Typed(pydantic.BaseModel):
+    type: str
+
+
 def is_sac(folder: Path) -> bool:
     """Whether a folder's ``config.json`` says that SAC was trained there."""
     try:
-        config = json.loads((folder / CONFIG).read_bytes())
-    except (OSError, ValueError):
+        return read_settings(_Typed, folder).type == TYPE
+    except PolicyError:
         return False
-    return isinstance(config, dict) and config.get("type") == TYPE
 
 
 def write_config(
@@ -126,6 +179,7 @@ def write_config(
         "type": TYPE,
         "format": 1,
         "task": spec.name,
+        **trained_for(spec).model_dump(),
         "action_mode": spec.action_mode,
         "inputs": inputs,
         "hidden": list(hidden),
@@ -141,15 +195,15 @@ def save_actor(folder: Path, actor: "Actor") -> None:
         folder: The checkpoint.
         actor: On any device.
     """
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     weights = {name: value.cpu().contiguous() for name, value in actor.state_dict().items()}
     with replacing(folder / WEIGHTS) as temporary:
-        save_file(weights, temporary)
+        temporary.write_bytes(save(weights))
 
 
-def read_config(folder: Path) -> dict[str, Any]:
-    """Read a folder's ``config.json``.
+def read_config(folder: Path) -> Config:
+    """Check a folder's files and read its ``config.json``; whoever loads the actor calls this.
 
     Args:
         folder: The checkpoint.
@@ -158,18 +212,20 @@ def read_config(folder: Path) -> dict[str, Any]:
         The parsed file.
 
     Raises:
-        PolicyError: There is none, or it is not of this kind.
+        PolicyError: There is none, it is not of this kind, or a file is damaged.
     """
     if not is_sac(folder):
         raise PolicyError(f"{folder} holds no {CONFIG} of type {TYPE}")
     if not (folder / WEIGHTS).is_file():
         raise PolicyError(f"{folder} has no {WEIGHTS}; train it with hvs train-sac")
-    config: dict[str, Any] = json.loads((folder / CONFIG).read_bytes())
+    check_files(folder)
+    config = read_settings(Config, folder)
+    read_shapes(folder)
     return config
 
 
-def check_fit(config: Mapping[str, Any], folder: Path, spec: Spec) -> None:
-    """Check that a task shows what the actor reads, in the same size, and takes its actions.
+def check_fit(config: Config, folder: Path, spec: Spec) -> None:
+    """Check that a task is what the actor was trained for, shows what it reads, takes its actions.
 
     Args:
         config: As `read_config` returns it.
@@ -177,31 +233,30 @@ def check_fit(config: Mapping[str, Any], folder: Path, spec: Spec) -> None:
         spec: The task.
 
     Raises:
-        PolicyError: It does not fit, or the file is damaged.
+        PolicyError: It does not fit.
     """
+    check_trained_for(config.model_dump(), folder, spec)
     shown = observation_names(spec.observations)
     mismatch = f"{folder} does not fit {spec.name}: "
-    try:
-        if spec.normalise_observation or spec.action_mode != config["action_mode"]:
-            raise PolicyError(
-                mismatch + f"it reads raw observations and commands {config['action_mode']}"
-            )
-        for name, part in config["inputs"].items():
-            if name not in shown:
-                raise PolicyError(mismatch + f"it reads {name}, which the task does not show")
-            if "shape" in part:
-                side = getattr(spec, f"{name}_resolution")
-                expected = [getattr(spec, f"{name}_channels"), side, side]
-                if part["shape"] != expected:
-                    raise PolicyError(
-                        mismatch + f"it reads {name} as {part['shape']} (channels, rows, columns), "
-                        f"the task shows {expected}"
-                    )
-    except (KeyError, TypeError, AttributeError) as error:
-        raise PolicyError(f"{folder}/{CONFIG} is damaged: {error}") from error
+    if spec.normalise_observation or spec.action_mode != config.action_mode:
+        raise PolicyError(mismatch + f"it reads raw observations and commands {config.action_mode}")
+    for name, part in config.inputs.items():
+        if name not in shown:
+            raise PolicyError(mismatch + f"it reads {name}, which the task does not show")
+        is_image = name in ("eih", "eth")
+        if is_image != (part.shape is not None):
+            raise PolicyError(mismatch + f"{name} is {'an' if is_image else 'no'} image")
+        if is_image:
+            side = getattr(spec, f"{name}_resolution")
+            expected = [getattr(spec, f"{name}_channels"), side, side]
+            if part.shape != expected:
+                raise PolicyError(
+                    mismatch + f"it reads {name} as {part.shape} (channels, rows, columns), "
+                    f"the task shows {expected}"
+                )
 
 
-def _load_actor(folder: Path, config: Mapping[str, Any]) -> "Actor":
+def _load_actor(folder: Path, config: Config) -> "Actor":
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
@@ -211,21 +266,23 @@ def _load_actor(folder: Path, config: Mapping[str, Any]) -> "Actor":
         raise PolicyError(
             f"playing {folder} needs Stable-Baselines3; install hvs-suite[learn]"
         ) from error
+    space = spaces.Dict({name: _space(part) for name, part in config.inputs.items()})
+    n_actions = 6 if config.action_mode == "flange_twist" else 7
+    action_space = spaces.Box(-1.0, 1.0, (n_actions,), np.float32)
+    check_weights(folder, lambda: make_actor(space, action_space, config.hidden))
     try:
-        space = spaces.Dict({name: _space(part) for name, part in config["inputs"].items()})
-        n_actions = 6 if config["action_mode"] == "flange_twist" else 7
-        action_space = spaces.Box(-1.0, 1.0, (n_actions,), np.float32)
-        actor = make_actor(space, action_space, list(config["hidden"]))
+        actor = make_actor(space, action_space, config.hidden)
         actor.load_state_dict(load_file(folder / WEIGHTS))
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
-        reason = str(error).splitlines()[0]
-        raise PolicyError(f"{folder} cannot be loaded as a SAC actor: {reason}") from error
+    except (SafetensorError, OSError, RuntimeError) as error:
+        raise PolicyError(
+            f"{folder} cannot be loaded as a SAC actor: {first_line(error)}"
+        ) from error
     actor.set_training_mode(False)
     return actor
 
 
-def _space(part: Mapping[str, Any]) -> spaces.Box:
-    if "shape" in part:
-        return spaces.Box(0, 255, tuple(part["shape"]), np.uint8)
-    high = np.array(part["high"], np.float32)
+def _space(part: Input) -> spaces.Box:
+    if part.shape is not None:
+        return spaces.Box(0, 255, tuple(part.shape), np.uint8)
+    high = np.array(part.high, np.float32)
     return spaces.Box(-high, high, dtype=np.float32)

@@ -7,6 +7,7 @@ few methods (see `hvs_suite.tasks.shared.family`).
 import hvs_suite.cell  # noqa: F401 - chooses the OpenGL backend before MuJoCo is imported
 
 # isort: split
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import mujoco
@@ -103,7 +104,8 @@ class ArmTask(composer.Task):
             )
         self.set_timesteps(control_timestep=spec.control_period_s, physics_timestep=timestep)
         self._observables = observations.make_observables(self)
-        self._step_bounds = tuple(spec.step_bounds.items())
+        self._bounded = tuple(m for m in spec.metrics if m.over == "step" and m.bound is not None)
+        self.slack = {}
         self._is_shaped = bool({"position", "rotation", "exponential"} & set(spec.rewards))
         self._scenario: Scenario | None = None
         self._goal_configurations: FloatArray | None = None
@@ -120,6 +122,20 @@ class ArmTask(composer.Task):
     def root_entity(self) -> composer.Entity:
         """The cell."""
         return self._cell
+
+    @property
+    def slack(self) -> Mapping[str, float]:
+        """What is added to each step bound, by the metric's unit; nothing as a rule."""
+        return self._slack
+
+    @slack.setter
+    def slack(self, slack: Mapping[str, float]) -> None:
+        self._slack = slack
+        self._step_bounds = tuple(
+            (metric.name, metric.bound + slack.get(metric.unit, 0.0))
+            for metric in self._bounded
+            if metric.bound is not None
+        )
 
     @property
     def observables(self) -> dict[str, Any]:

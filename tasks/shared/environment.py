@@ -16,7 +16,7 @@ import hvs_suite.cell  # noqa: F401 - chooses the OpenGL backend before MuJoCo i
 # isort: split
 import dataclasses
 import weakref
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import dm_env
@@ -201,6 +201,15 @@ class Environment(composer.Environment):
     def judge(self, share: float, steps: int) -> tuple[Any, ...]:
         """How a control step would be judged; see ``ArmTask.judge_at``."""
         return self._arm.judge_at(self._physics_proxy, share, steps)
+
+    @property
+    def slack(self) -> Mapping[str, float]:
+        """What is added to each step bound, by unit; nothing but for re-simulation."""
+        return self._arm.slack
+
+    @slack.setter
+    def slack(self, slack: Mapping[str, float]) -> None:
+        self._arm.slack = slack
 
     @property
     def spec(self) -> Spec:

@@ -162,7 +162,9 @@ def store(task: str, entry: LockEntry) -> None:
     """
     entries = lock() | {task: entry}
     with replacing(FILE) as path:
-        content = {name: dataclasses.asdict(entry) for name, entry in entries.items()}
+        # In the order in which tasks are listed, whatever was certified last.
+        order = [*(name for name in registered() if name in entries), *entries]
+        content = {name: dataclasses.asdict(entries[name]) for name in dict.fromkeys(order)}
         path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     lock.cache_clear()
 

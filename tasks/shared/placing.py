@@ -8,7 +8,7 @@ import dataclasses
 import math
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -74,6 +74,8 @@ class PlacingSpec(Spec):
         height_tolerance_mm: Bound on the error along the normal, or None.
         tilt_tolerance_deg: Bound on the angle between flange axis and inward surface normal.
     """
+
+    headline: ClassVar[tuple[str, ...]] = (POSITION, TILT)
 
     ring_m: tuple[float, float] = scene((0.40, 0.78))
     target_diameter_m: float = 0.050

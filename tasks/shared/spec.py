@@ -179,6 +179,8 @@ class Spec(Timing, Cameras, Disturbances):
     """Points whose projections supervise eyes; `Family.keypoints` gives their places."""
     further_privileged: ClassVar[Mapping[str, tuple[str, ...]]] = MappingProxyType({})
     """Columns of `Family.privileged`, with the names of their dimensions."""
+    headline: ClassVar[tuple[str, ...]]
+    """Metrics that boards show beside success, the most telling first."""
     plays_on: ClassVar[bool] = True
     """Whether an episode can go on past its goal, to see where a policy settles."""
 

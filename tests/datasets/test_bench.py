@@ -8,7 +8,7 @@ import pytest
 import hvs_suite
 from hvs_suite.cli.bench_expert import LABELS, least_times
 from hvs_suite.cli.main import run
-from hvs_suite.tasks.shared.scenario import steps_lower_bound
+from hvs_suite.tasks.shared.start import steps_lower_bound
 
 
 def test_expert_figures_meet_the_bound(capsys):
@@ -29,10 +29,11 @@ def test_bound_is_the_scenarios_own():
     with hvs_suite.load("align-drill", split="test", observations="state") as env:
         for scenario in range(3):
             env.reset(scenario=scenario)
-            truth = env.privileged()
-            where = (env.scenario.start, truth["goal_position"], truth["goal_normal"])
-            limited, quick, steps, quick_steps = least_times(env.spec, *where)
-            assert steps == steps_lower_bound(env.spec, *where)
+            start, goal = env.scenario.start, env.goal()
+            limited, quick, steps, quick_steps = least_times(
+                env.spec, start, goal.position, goal.normal
+            )
+            assert steps == steps_lower_bound(env.spec, start, goal)
             assert quick < limited
             further = env.spec.hold_steps - 1 + env.spec.latency_steps
             assert quick_steps == np.ceil(quick / 0.1) + further

@@ -188,6 +188,15 @@ def test_finds_and_names(kind, copy):
     ], [str(each) for each in found]
 
 
+def test_pictures_in_dictionaries_are_read_as_any_others(copy):
+    """As LeRobot's own writer leaves them, row group by row group."""
+    table = pq.read_table(copy / DATA)
+    pq.write_table(
+        table, copy / DATA, row_group_size=7, use_dictionary=True, dictionary_pagesize_limit=9000
+    )
+    assert [str(each) for each in check_dataset(copy).damage] == []
+
+
 def test_damage_of_one_episode_is_not_laid_to_others(copy):
     change_column(copy, "observation.state", add(1e-3, 3))
     found = check_dataset(copy, pictures=False).damage

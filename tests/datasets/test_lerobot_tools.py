@@ -39,6 +39,7 @@ def call(folder, *words, **variables):
         "HOME": str(folder / "home"),
         "HF_HOME": str(folder / "home" / "hf"),
         "HF_HUB_OFFLINE": "1",
+        "OMP_NUM_THREADS": "1",
         **variables,
     }
     return subprocess.run(

@@ -95,10 +95,11 @@ def test_from_a_random_start_the_way_is_the_one_that_the_policy_takes_to_be_the_
             truth = env.privileged()
             q, goal = truth["joint_positions"], truth["goal_position"]
             turns, time_s, within = way_to_posture(torch.tensor(q[None]), torch.tensor(goal[None]))
-            demonstrator._remember_goal(goal, truth["goal_normal"])
-            family = demonstrator._reachable(q, np.zeros(7), goal, truth["goal_normal"])
+            planner = demonstrator._planner
+            planner._remember_goal(env.goal())
+            family = planner._reachable(q, np.zeros(7), env.goal())
             both += len(family) == 2
-            first = next(iter(demonstrator._in_order(q, np.zeros(7), family)))
+            first = next(iter(planner._in_order(q, np.zeros(7), family)))
             np.testing.assert_allclose(first[:6], q[:6] + turns[0].numpy(), atol=1e-6)
             slowest = np.abs(turns[0].numpy() / JOINT_SPEED_RAD_S[:6]).max()
             assert (time_s.item(), within.item()) == (pytest.approx(slowest), 1.0)

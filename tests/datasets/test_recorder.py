@@ -46,7 +46,7 @@ def test_plain_lerobot_reads_the_dataset_offline(dataset, monkeypatch):
     assert frame["observation.images.eth"].shape == (3, 112, 112)
     assert frame["observation.state"].shape == (14,)
     assert frame["action"].shape == (7,)
-    assert frame["task"] == hvs_suite.TASKS[TASK].instruction
+    assert frame["task"] == hvs_suite.TASKS[TASK].instruction()
     assert loaded.meta.features["observation.state"]["names"][:8] == [
         *(f"A{i}.pos" for i in range(1, 8)),
         "A1.vel",

@@ -11,11 +11,12 @@ from hvs_suite.cli import main
 from hvs_suite.errors import ResultError, UnknownTaskError
 from hvs_suite.eval import comparison, lerobot_import, result_file
 from hvs_suite.eval.result_file import Result, Summary
+from hvs_suite.registry import find
 
 
 def save(path: Path, name: str, solved: list[bool], **changes: Any) -> Path:
     result = make_result()
-    metadata = result.metadata.model_copy(update=changes)
+    metadata = result.metadata.model_copy(update={"n_logged": len(solved)} | changes)
     rows = [
         row(
             i,
@@ -24,7 +25,6 @@ def save(path: Path, name: str, solved: list[bool], **changes: Any) -> Path:
             n_clipped=0,
             steps=10,
             steps_to_goal=10 if won else None,
-            settled_steps=20 if won else 10,
         )
         for i, won in enumerate(solved)
     ]
@@ -58,8 +58,9 @@ def test_a_clear_difference_is_called_one(tmp_path: Path) -> None:
     assert comparison.compare(b, a).conclusion().startswith("good succeeds more often than poor")
     assert found.steps_to_goal is not None
     assert found.steps_to_goal.n == 25
-    assert found.settled_position_mm is not None
-    assert found.settled_position_mm.high < 0.0
+    # By the task's headline metrics, and no others.
+    assert list(found.settled) == list(find("align-easy").headline)
+    assert all(difference.high < 0.0 for difference in found.settled.values())
 
 
 def test_what_chance_explains_is_not_called_a_difference(tmp_path: Path) -> None:
@@ -130,6 +131,7 @@ def test_an_imported_file_is_compared_but_never_verified(
     ours = save(tmp_path / "b.json", "ours", [True] * 4)
     found = comparison.compare(out, ours)
     assert found.n_only_b == 1
+    assert found.settled == {}
     assert "unverified" in found.conclusion()
     assert main.run(["verify", str(out)]) == 1
 

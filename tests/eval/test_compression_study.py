@@ -197,7 +197,7 @@ def test_the_report_names_every_setting_and_draws_success(studied: tuple[Path, S
     _, measured = studied
     success = Success(
         n=20, n_success=15, pc_success_ci95=(53.0, 88.0), n_only_lossless=2, n_only_this=1, p=1.0,
-        position_error_mm=3.0, tilt_error_deg=0.5, settled_position_error_mm=0.4,
+        errors={"lateral_error_mm": 3.0, "tilt_error_deg": 0.5}, settled_error=0.4,
     )  # fmt: skip
     trained = [row.model_copy(update={"success": success}) for row in measured.rows]
     for study, panels in (

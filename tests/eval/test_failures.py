@@ -38,7 +38,7 @@ def test_a_failure_has_its_cause(policy, cause, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("estimate_mm", "errors_mm", "cause"),
+    ("estimate_mm", "distances_mm", "cause"),
     [
         (7.0, [900.0, 30.0, 8.0, 7.0, 7.0], Cause.MISPLACED),
         (0.5, [900.0, 90.0, 60.0, 30.0, 9.0], Cause.SLOW),
@@ -46,9 +46,10 @@ def test_a_failure_has_its_cause(policy, cause, tmp_path):
         (None, [900.0, 90.0], Cause.SLOW),
     ],
 )
-def test_an_estimate_and_the_last_steps_tell_eye_from_hand(estimate_mm, errors_mm, cause):
-    lost = row(0, success=False, error=errors_mm[-1])
-    assert cause_of(lost, hvs_suite.TASKS[TASK], 3, estimate_mm, errors_mm) is cause
+def test_an_estimate_and_the_last_steps_tell_eye_from_hand(estimate_mm, distances_mm, cause):
+    lost = row(0, success=False, error=distances_mm[-1])
+    distances_m = [distance / 1000 for distance in distances_mm]
+    assert cause_of(lost, hvs_suite.TASKS[TASK], 3, estimate_mm, distances_m) is cause
 
 
 def test_what_was_solved_is_no_failure(tmp_path):

@@ -193,7 +193,7 @@ LOGS: dict[str, tuple[Callable[[], bytes], str]] = {
     ),
     "more steps than the task has": (
         lambda: arrays(np.array([10**6] + 9 * [0]), np.zeros((10**6, 7), np.float32)),
-        "settled_steps is",
+        "settled.steps is",
     ),
 }
 

@@ -22,7 +22,7 @@ WINS = {"alpha": 9, "beta": 3, "gamma-long-name": 6}
 
 def entry(policy: str, task: str) -> Entry:
     rows = [
-        row(k, success=k < WINS[policy], error=float(k), settled_x_mm=k / 2, settled_y_mm=-k / 3)
+        row(k, success=k < WINS[policy], error=float(k), settled={"x_mm": k / 2, "y_mm": -k / 3})
         for k in range(10)
     ]
     summary = result_file.Summary.of(

@@ -1,6 +1,5 @@
 """A result file says what happened, and one that cannot be true is refused with the reason."""
 
-import copy
 import json
 from pathlib import Path
 from typing import Any
@@ -13,38 +12,50 @@ from hvs_suite.eval import result_file
 TOLERANCES = {"position_error_mm": 5.0, "tilt_error_deg": 5.0}
 
 
-def row(scenario: int, *, success: bool, error: float, **changes: Any) -> result_file.EpisodeRow:
-    steps = 10 + scenario
-    settled = error / 10 if success else error
-    values: dict[str, Any] = {
-        "scenario": scenario,
-        "success": success,
-        "success_once": success,
-        "collision": not success and scenario % 2 == 1,
-        "truncated": not success and scenario % 2 == 0,
-        "steps": steps,
-        "steps_to_goal": steps if success else None,
-        "n_clipped": scenario,
+def errors_of(error: float) -> dict[str, float]:
+    return {
         "position_error_mm": error,
         "lateral_error_mm": error,
         "height_error_mm": 0.0,
         "tilt_error_deg": 2 * error,
-        "failure": None,
-        "settled_steps": 20 if success else steps,
-        "settled_collision": not success and scenario % 2 == 1,
-        "settled_failure": None,
-        "settled_position_error_mm": settled,
-        "settled_lateral_error_mm": settled,
-        "settled_height_error_mm": 0.0,
-        "settled_tilt_error_deg": 2 * settled,
-        "settled_x_mm": settled,
-        "settled_y_mm": 0.0,
     }
-    return result_file.EpisodeRow(**(values | changes))
+
+
+def row(
+    scenario: int, *, success: bool, error: float, settled: Any = None, **changes: Any
+) -> result_file.EpisodeRow:
+    """A row; `settled` changes where it ended, which without success is what it was scored on."""
+    steps = 10 + scenario
+    collision = not success and scenario % 2 == 1
+    values: dict[str, Any] = {
+        "scenario": scenario,
+        "success": success,
+        "success_once": success,
+        "collision": collision,
+        "truncated": not success and not collision,
+        "steps": steps,
+        "steps_to_goal": steps if success else None,
+        "n_clipped": scenario,
+        "failure": None,
+        "errors": errors_of(error),
+    } | changes
+    rest = error / 10 if success else error
+    end = {
+        "steps": 20 if success else values["steps"],
+        "collision": values["collision"],
+        "failure": values["failure"],
+        "errors": errors_of(rest),
+        "x_mm": rest,
+        "y_mm": 0.0,
+    }
+    return result_file.EpisodeRow(**values, settled=end | (settled or {}))
 
 
 def make_result(n: int = 5, **summary: Any) -> result_file.Result:
-    rows = [row(i, success=i < 3, error=float(i) / 3) for i in range(n)]
+    return of_rows([row(i, success=i < 3, error=float(i) / 3) for i in range(n)], **summary)
+
+
+def of_rows(rows: list[result_file.EpisodeRow], **summary: Any) -> result_file.Result:
     names = {"task": "align-easy", "policy": "zero", "split": "test"} | summary
     return result_file.Result(
         schema_version=result_file.SCHEMA_VERSION,
@@ -66,6 +77,7 @@ def make_result(n: int = 5, **summary: Any) -> result_file.Result:
             training_hours=None,
             decision_limit_s=10.0,
             actions_sha256=64 * "0",
+            n_logged=len(rows),
             packages={"numpy": "2.2.6"},
             gl_renderer="llvmpipe",
             cpu="a processor",
@@ -84,22 +96,23 @@ def test_the_summary_counts_what_the_rows_say() -> None:
     assert summary.pc_success_ci95 == pytest.approx([23.07, 88.24], abs=0.01)
     assert (summary.n_collision, summary.n_clipped) == (1, 10)
     assert summary.steps_to_goal_mean == 11.0
-    assert summary.position_error_mm.p50 == pytest.approx(2 / 3)
-    assert summary.position_error_mm.p95 == pytest.approx(3.8 / 3)
-    assert summary.position_error_mm.iqm == pytest.approx(2 / 3)
-    assert summary.tilt_error_deg.p50 == pytest.approx(4 / 3)
+    assert summary.errors["position_error_mm"].p50 == pytest.approx(2 / 3)
+    assert summary.errors["position_error_mm"].p95 == pytest.approx(3.8 / 3)
+    assert summary.errors["position_error_mm"].iqm == pytest.approx(2 / 3)
+    assert summary.errors["tilt_error_deg"].p50 == pytest.approx(4 / 3)
 
 
 def test_the_settled_figures_are_those_past_the_goal() -> None:
     summary = make_result().summary
-    assert summary.settled_position_error_mm.p50 == pytest.approx(0.2 / 3)
-    assert summary.settled_position_error_mm.p99 > 1.0
-    low, high = summary.settled_position_error_mm.iqm_ci95
-    assert low <= summary.settled_position_error_mm.iqm <= high
+    assert summary.settled.errors["position_error_mm"].p50 == pytest.approx(0.2 / 3)
+    assert summary.settled.errors["position_error_mm"].p99 > 1.0
+    low, high = summary.settled.errors["position_error_mm"].iqm_ci95
+    assert low <= summary.settled.errors["position_error_mm"].iqm <= high
     # The fourth episode collided: no tolerance makes that a success.
-    assert summary.settled_n_lost == 1
-    assert summary.settled_success_by_scale.pc_success[-1] == 80.0
-    assert summary.settled_sharpest_95.scale is None
+    assert summary.settled.n_lost == 1
+    assert summary.settled.success_by_scale is not None
+    assert summary.settled.success_by_scale.pc_success[-1] == 80.0
+    assert summary.settled.sharpest_95.scale is None
 
 
 def test_success_against_steps_ends_at_the_success_rate() -> None:
@@ -109,7 +122,7 @@ def test_success_against_steps_ends_at_the_success_rate() -> None:
 
 
 def test_the_reasons_of_lost_episodes_are_counted() -> None:
-    lost = {"truncated": False, "failure": "not finite", "settled_failure": "not finite"}
+    lost = {"truncated": False, "failure": "not finite"}
     rows = [row(0, success=False, error=1.0, **lost), row(2, success=False, error=1.0)]
     summary = result_file.Summary.of(
         "t", "p", "test", rows, tolerances=TOLERANCES, time_limit_steps=20
@@ -125,15 +138,60 @@ def test_a_written_result_reads_back_the_same(tmp_path: Path) -> None:
     assert [file.name for file in path.parent.iterdir()] == ["align-easy.json"]
 
 
-def test_each_row_stands_on_its_own_line_with_the_fixed_keys(tmp_path: Path) -> None:
+def test_a_bound_of_0_has_no_multiples() -> None:
+    rows = [row(i, success=i < 3, error=float(i)) for i in range(5)]
+    settled = result_file.SettledSummary.of(rows, {"position_error_mm": 0.0})
+    assert settled.success_by_scale is None
+    assert settled.sharpest_95.scale is None
+    assert settled.errors["position_error_mm"].p50 == pytest.approx(0.2)
+
+
+def test_a_goal_may_come_before_the_last_scored_step() -> None:
+    rows = [row(0, success=True, error=1.0, steps=20, steps_to_goal=12)]
+    summary = result_file.Summary.of(
+        "t", "p", "test", rows, tolerances=TOLERANCES, time_limit_steps=20
+    )
+    assert summary.steps_to_goal_mean == 12.0
+    assert summary.success_by_step[10:12] == [0.0, 100.0]
+
+
+def test_each_column_stands_on_its_own_line_and_what_never_differs_is_said_once(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "result.json"
     result_file.write(make_result(), path)
-    content = json.loads(path.read_text())
-    keys = "scenario success success_once collision truncated steps steps_to_goal n_clipped"
-    fixed = [*keys.split(), *result_file.ERRORS]
-    assert list(content["episodes"][0])[: len(fixed)] == fixed
-    lines = path.read_text().splitlines()
-    assert json.dumps(content["episodes"][1]) + "," in [line.strip() for line in lines]
+    columns = json.loads(path.read_text())["episodes"]
+    assert columns["steps"] == [10, 11, 12, 13, 14]
+    assert columns["errors"]["height_error_mm"] == 0.0
+    assert columns["failure"] is None
+    assert "scenario" not in columns
+    # Three of five played on past the goal; none of them collided there.
+    assert columns["settled"]["steps"] == [20, 20, 20, 13, 14]
+    assert "collision" not in columns["settled"]
+    lines = [line.strip().removesuffix(",") for line in path.read_text().splitlines()]
+    assert '"steps": [10,11,12,13,14]' in lines
+    assert '"height_error_mm": 0.0' in lines
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [row(0, success=True, error=1.0)],
+        [row(i, success=False, error=1.0 + i) for i in range(4)],
+        [row(i, success=True, error=0.5, settled={"steps": 30 + i}) for i in range(3)],
+        [
+            row(0, success=True, error=1.0, settled={"collision": True}),
+            row(1, success=True, error=1.0, settled={"failure": "too slow"}),
+        ],
+    ],
+    ids=["one", "none played on", "equal but for the end", "lost after the goal"],
+)
+def test_columns_read_back_as_the_rows_that_were_written(
+    rows: list[result_file.EpisodeRow], tmp_path: Path
+) -> None:
+    path = tmp_path / "result.json"
+    result_file.write(of_rows(rows), path)
+    assert result_file.load(path).episodes == rows
 
 
 def test_a_result_cannot_be_written_below_a_file(tmp_path: Path) -> None:
@@ -147,28 +205,64 @@ BROKEN: dict[str, tuple[Any, str]] = {
     "unknown key": (lambda c: c["summary"].update(extra=1), "summary.extra"),
     "other schema": (lambda c: c.update(schema_version=99), "schema_version is 99"),
     "no schema": (lambda c: c.pop("schema_version"), "schema_version is None"),
-    "no rows": (lambda c: c.update(episodes=[]), "episodes"),
-    "text for a number": (lambda c: c["episodes"][0].update(steps="10"), "episodes.0.steps"),
+    "no rows": (lambda c: c.update(episodes=[]), "holds no columns of episodes"),
+    "text for a number": (lambda c: c["episodes"].update(steps=5 * ["10"]), "episodes.0.steps"),
     "a negative error": (
-        lambda c: c["episodes"][0].update(tilt_error_deg=-1.0),
-        "episodes.0.tilt_error_deg",
+        lambda c: c["episodes"]["errors"].update(tilt_error_deg=-1.0),
+        "episodes.0.errors.tilt_error_deg",
     ),
     "an infinite error": (
-        lambda c: c["episodes"][0].update(tilt_error_deg=float("inf")),
+        lambda c: c["episodes"]["errors"].update(tilt_error_deg=float("inf")),
         "Infinity is no number",
     ),
-    "a scenario twice": (
-        lambda c: c["episodes"].insert(1, copy.deepcopy(c["episodes"][0])),
-        "scenario 0 appears more than once",
+    "a column that is too short": (
+        lambda c: c["episodes"]["steps"].pop(),
+        "episodes: steps holds 4 values for 5 episodes",
     ),
-    "a scenario left out": (lambda c: c["episodes"].pop(3), "scenarios 0..N-1"),
-    "another order": (lambda c: c["episodes"].reverse(), "in this order"),
+    "a column of a metric that is too long": (
+        lambda c: c["episodes"]["errors"]["tilt_error_deg"].append(1.0),
+        "episodes: tilt_error_deg holds 6 values for 5 episodes",
+    ),
+    "a column left out": (lambda c: c["episodes"].pop("steps"), "episodes.0.steps"),
+    "a column too many": (lambda c: c["episodes"].update(extra=1), "episodes.0.extra"),
+    "scenarios of its own": (
+        lambda c: c["episodes"].update(scenario=[0, 0, 1, 2, 3]),
+        "are scenarios 0..N-1",
+    ),
+    "more columns than any task has": (
+        lambda c: c["episodes"]["errors"].update({f"error_{k}_mm": 0.0 for k in range(1000)}),
+        "columns of episodes",
+    ),
+    "more episodes than rows": (
+        lambda c: c["summary"].update(n_episodes=6),
+        "values for 6 episodes",
+    ),
+    "episodes without number": (
+        lambda c: c["summary"].update(n_episodes=10**9),
+        "holds no columns of episodes",
+    ),
+    "a metric without its settled figure": (
+        lambda c: c["episodes"]["settled"]["errors"].pop("tilt_error_deg"),
+        "must have the metrics of errors",
+    ),
+    "a log of fewer scenarios, of no built-in policy": (
+        lambda c: c["metadata"].update(n_logged=3, policy_kind="module"),
+        "n_logged must be the number of rows",
+    ),
+    "a log of more scenarios": (
+        lambda c: c["metadata"].update(n_logged=6),
+        "n_logged must be the number of rows",
+    ),
     "a success without its steps": (
-        lambda c: c["episodes"][0].update(steps_to_goal=None),
-        "steps_to_goal must equal",
+        lambda c: c["episodes"].update(steps_to_goal=[None, 11, 12, None, None]),
+        "steps_to_goal is a number for a success",
+    ),
+    "a goal after the last step": (
+        lambda c: c["episodes"].update(steps_to_goal=[11, 11, 12, None, None]),
+        "steps_to_goal must lie between 1 and steps",
     ),
     "two ends": (
-        lambda c: c["episodes"][0].update(collision=True),
+        lambda c: c["episodes"]["collision"].__setitem__(0, True),
         "an episode has one end",
     ),
     "a flattered summary": (
@@ -176,11 +270,11 @@ BROKEN: dict[str, tuple[Any, str]] = {
         "summary.pc_success is not what the episodes give",
     ),
     "a flattered error": (
-        lambda c: c["summary"]["tilt_error_deg"].update(p95=0.0),
-        "summary.tilt_error_deg is not",
+        lambda c: c["summary"]["errors"]["tilt_error_deg"].update(p95=0.0),
+        "summary.errors is not",
     ),
     "a settled figure that is not the episode's": (
-        lambda c: c["episodes"][4].update(position_error_mm=0.0),
+        lambda c: c["episodes"]["errors"]["position_error_mm"].__setitem__(4, 0.0),
         "settled figures must be the episode's own",
     ),
     "another version of a package": (
@@ -190,11 +284,11 @@ BROKEN: dict[str, tuple[Any, str]] = {
     "no seal": (lambda c: c.pop("sha256"), "was changed after it was written"),
     "a bound on nothing": (
         lambda c: c["metadata"].update(tolerances={"yaw": 1.0}),
-        "tolerances.yaw",
+        "tolerances bounds what is no metric",
     ),
     "a flattered row": (
-        lambda c: c["episodes"][2].update(position_error_mm=0.0),
-        "summary.position_error_mm is not",
+        lambda c: c["episodes"]["errors"]["position_error_mm"].__setitem__(2, 0.0),
+        "summary.errors is not",
     ),
 }
 

@@ -54,7 +54,7 @@ def test_a_policy_that_breaks_down_loses_the_episode_and_the_run_goes_on(
     assert result.summary.n_failure == 2
     for row in result.episodes:
         assert (row.failure, row.steps, row.truncated) == (reason, 1, False)
-        assert row.position_error_mm > 0.0
+        assert row.errors["position_error_mm"] > 0.0
 
 
 def test_the_deadline_leaves_no_timer_behind() -> None:
@@ -85,7 +85,9 @@ def test_seeds_are_a_run_s_own_and_the_same_for_any_workers_and_after_an_interru
         for out, workers in ((one, 1), (two, 2), (tmp_path / "another.json", 1))
     )
     assert first.episodes == second.episodes
-    ends = [{row.tilt_error_deg for row in result.episodes} for result in (first, another)]
+    ends = [
+        {row.errors["tilt_error_deg"] for row in result.episodes} for result in (first, another)
+    ]
     assert not ends[0] & ends[1]
     assert first.metadata.policy_kind == "module"
     assert first.metadata.policy_hash is not None
@@ -203,19 +205,18 @@ def test_the_score_is_the_episode_that_ends_at_the_goal() -> None:
                 episode.steps,
                 episode.steps_to_goal,
             )
-            for name in result_file.ERRORS:
-                assert getattr(row, name) == pytest.approx(getattr(episode, name), abs=1e-6)
+            assert row.errors == pytest.approx(episode.errors, abs=1e-6)
 
 
 def test_past_the_goal_the_policy_plays_on_to_the_time_limit_and_settles() -> None:
     result = protocol.evaluate("expert", TASK, episodes=2)
     for row in result.episodes:
-        assert row.steps < row.settled_steps == TASKS[TASK].time_limit_steps
-        assert row.settled_position_error_mm < 0.02
-        assert np.hypot(row.settled_x_mm, row.settled_y_mm) == pytest.approx(
-            row.settled_lateral_error_mm, abs=1e-5
+        assert row.steps < row.settled.steps == TASKS[TASK].time_limit_steps
+        assert row.settled.errors["position_error_mm"] < 0.02
+        assert np.hypot(row.settled.x_mm, row.settled.y_mm) == pytest.approx(
+            row.settled.errors["lateral_error_mm"], abs=1e-5
         )
-    assert result.summary.settled_sharpest_95.position_error_mm is not None
+    assert result.summary.settled.sharpest_95.errors["position_error_mm"] is not None
 
 
 def test_playing_on_changes_no_scenario() -> None:
@@ -231,7 +232,7 @@ def test_the_action_log_holds_every_action(tmp_path: Path) -> None:
     path = tmp_path / "zero.json"
     result = protocol.evaluate("random", TASK, path, episodes=2)
     log = action_log.load(result_file.actions_path(path), result.metadata.actions_sha256)
-    assert [len(actions) for actions in log] == [row.settled_steps for row in result.episodes]
+    assert [len(actions) for actions in log] == [row.settled.steps for row in result.episodes]
     assert sorted(file.name for file in tmp_path.iterdir()) == ["zero.actions.npz", "zero.json"]
 
 

@@ -1,20 +1,24 @@
 """A result is what its logged actions give; whatever is altered in it, or beside it, is found."""
 
+import dataclasses
 import io
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import dm_env
 import numpy as np
 import pytest
+from dm_env import specs
 
 from hvs_suite.cli import main
 from hvs_suite.errors import ResultError
-from hvs_suite.eval import protocol, result_file, verification
+from hvs_suite.eval import board_clips, failures, protocol, result_file, verification
 from hvs_suite.eval.result_file import EpisodeRow, Summary
-from hvs_suite.eval.trial import Course
+from hvs_suite.eval.trial import EpisodeLostError, play_trial
+from hvs_suite.policies import builtin
 
 TASK = "align-thesis"
 
@@ -38,7 +42,7 @@ def test_an_honest_result_is_verified(name: str, made: Path) -> None:
     verdict = verification.verify(made / f"{name}.json")
     assert (verdict.n_episodes, verdict.n_played, verdict.n_near) == (3, 3, 0)
     # Pictures or none, one process or two: the physics is the same to the last bit.
-    assert verdict.largest_mm == verdict.largest_deg == 0.0
+    assert set(verdict.largest.values()) == {0.0}
 
 
 def test_verifying_draws_no_picture(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -78,26 +82,71 @@ def test_lost_episodes_are_verified_up_to_where_they_were_lost(
 # --- what rounding may excuse ---------------------------------------------------------------------
 
 
-def course(excess: list[float], hold_steps: int = 2, **changes: Any) -> Course:
-    """A course whose errors tell the step they were taken at."""
-    n = len(excess)
-    values: dict[str, Any] = {
-        "scenario": 0,
-        "hold_steps": hold_steps,
-        "actions": np.zeros((n, 7), np.float32),
-        "inside": np.array(excess) <= 0.0,
-        "excess": np.array(excess),
-        "clipped": np.ones(n, np.bool_),
-        "errors": [dict.fromkeys(result_file.ERRORS, float(step)) for step in range(n + 1)],
-        "collision": False,
-        "truncated": True,
-        "failure": None,
-        "landing_mm": np.zeros(2),
-    }
-    return Course(**(values | changes))
+@dataclasses.dataclass
+class Script:
+    """A stage whose steps end as far outside its bound as is written (mm), whatever is done.
+
+    As a real one, it knows a success, which does not end it, and a slack on its bound.
+    """
+
+    excess_mm: list[float]
+    collision: bool = False
+    hold_steps: int = 2
+    goal_ends_episode: bool = True
+    slack: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    landing_mm: Any = (0.0, 0.0)
+
+    def action_spec(self) -> Any:
+        return specs.BoundedArray((7,), np.float32, -1.0, 1.0)
+
+    def reset(self, *, scenario: int | None = None) -> dm_env.TimeStep:
+        self.step_count, self.held, self.once, self.done = 0, 0, False, False
+        return dm_env.restart({})
+
+    def step(self, action: Any) -> dm_env.TimeStep:
+        inside = self.excess_mm[self.step_count] <= self.slack.get("mm", 0.0)
+        self.step_count += 1
+        self.held = self.held + 1 if inside else 0
+        self.once |= inside
+        self.done |= self.held >= self.hold_steps
+        return dm_env.termination(0.0, {}) if self.is_over else dm_env.transition(0.0, {})
+
+    @property
+    def is_over(self) -> bool:
+        return self.step_count == len(self.excess_mm)
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """The error is the number of the step, so that it tells where it was taken."""
+        return {
+            "is_success": self.done,
+            "success_once": self.once,
+            "collision": self.is_over and self.collision,
+            "truncated": self.is_over and not self.collision,
+            "steps_to_goal": self.step_count,
+            "errors": {"position_error_mm": float(self.step_count)},
+        }
 
 
-OUT, IN, JUST_OUT, JUST_IN = 50.0, -50.0, 0.5, -0.5
+def outcome_of(
+    stage: Script, *, failure: str | None = None, action: float = 0.0
+) -> tuple[EpisodeRow, Any]:
+    """The row of a policy that always does the same; at the end it may fail."""
+
+    def decide(_: Any) -> Any:
+        if failure is not None and stage.step_count == len(stage.excess_mm) - 1:
+            raise EpisodeLostError(failure)
+        return np.full(7, action, np.float32)
+
+    return play_trial(stage, lambda: None, decide, 0)
+
+
+def replayed(stage: Script, said: EpisodeRow, actions: Any) -> tuple[EpisodeRow, bool]:
+    return verification.ReplayTrial({0: actions}, {0: said})(stage, builtin.make_zero(stage), 0)
+
+
+NEAR = verification.NEAR["mm"]
+OUT, IN, JUST_OUT, JUST_IN = 50.0, -50.0, NEAR / 2, -NEAR / 2
 
 
 @pytest.mark.parametrize(
@@ -109,17 +158,18 @@ OUT, IN, JUST_OUT, JUST_IN = 50.0, -50.0, 0.5, -0.5
         ([JUST_IN, IN, IN, OUT], [OUT, IN, IN, OUT]),
         ([OUT, JUST_OUT, OUT, OUT], [OUT, IN, OUT, OUT]),
         ([OUT, JUST_IN, OUT, OUT], [OUT, OUT, OUT, OUT]),
-        ([JUST_OUT, JUST_OUT, JUST_OUT, OUT], [OUT, IN, IN, OUT]),
+        ([JUST_OUT, JUST_OUT, OUT, OUT], [IN, IN, OUT, OUT]),
     ],
 )
 def test_rounding_excuses_the_outcome_that_it_can_have_made(
     played: list[float], claimed: list[float]
 ) -> None:
-    said = course(claimed).row()
-    found = course(played).could_be(said)
+    said, actions = outcome_of(Script(claimed))
+    stage = Script(played)
     # Errors and clipped actions are those of the claimed end.
-    assert found == said
-    assert found != course(played).row()
+    assert replayed(stage, said, actions) == (said, True)
+    assert outcome_of(stage)[0] != said
+    assert stage.slack == {}
 
 
 @pytest.mark.parametrize(
@@ -136,38 +186,116 @@ def test_rounding_excuses_the_outcome_that_it_can_have_made(
         ([OUT, OUT, OUT, OUT], [OUT, IN, OUT, OUT]),
         ([OUT, IN, OUT, JUST_IN], [OUT, OUT, OUT, OUT]),
         ([np.inf, JUST_OUT, OUT, OUT], [IN, IN, OUT, OUT]),
+        # Of two steps that rounding may move, neither one alone: both go with their bound.
+        ([JUST_OUT, JUST_OUT, JUST_OUT, OUT], [OUT, IN, IN, OUT]),
     ],
 )
 def test_rounding_excuses_no_other_outcome(played: list[float], claimed: list[float]) -> None:
-    said = course(claimed).row()
-    assert course(played).could_be(said) == course(played).row() != said
+    said, actions = outcome_of(Script(claimed))
+    stage = Script(played)
+    own, _ = outcome_of(stage)
+    assert replayed(stage, said, actions) == (own, False)
+    assert own != said
 
 
 @pytest.mark.parametrize(
-    "change",
-    [
-        {"collision": True, "truncated": False},
-        {"failure": "too slow", "truncated": False},
-        {"clipped": np.zeros(4, np.bool_)},
-    ],
+    ("collision", "how"), [(True, {}), (False, {"failure": "too slow"}), (False, {"action": 2.0})]
 )
-def test_rounding_excuses_no_collision_failure_or_clipping(change: dict[str, Any]) -> None:
+def test_rounding_excuses_no_collision_failure_or_clipping(
+    collision: bool, how: dict[str, Any]
+) -> None:
     excess = [OUT, JUST_OUT, OUT, OUT]
-    said = course(excess, **change).row()
-    assert course(excess).could_be(said) != said
+    said, _ = outcome_of(Script(excess, collision=collision), **how)
+    stage = Script(excess)
+    own, actions = outcome_of(stage)
+    found, by_rounding = replayed(stage, said, actions)
+    assert not by_rounding
+    assert found == own != said
 
 
 def test_only_a_handful_of_outcomes_is_left_to_rounding(
     made: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def always(self: Course, claimed: EpisodeRow) -> EpisodeRow:
-        return claimed
+    def always(
+        self: verification.ReplayTrial, env: Any, policy: Any, scenario: int
+    ) -> tuple[EpisodeRow, bool]:
+        return self.claimed[scenario], True
 
-    other = result_file.load(made / "expert.json").episodes[0].model_copy(update={"steps": 99})
-    monkeypatch.setattr(Course, "could_be", always)
-    monkeypatch.setattr(Course, "row", lambda self: other)
+    monkeypatch.setattr(verification.ReplayTrial, "__call__", always)
     with pytest.raises(ResultError, match="decided 3 of 3 outcomes as the file says"):
         verification.verify(made / "expert.json")
+
+
+# --- what the log does not hold -------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module", params=["expert", "random"])
+def partly_logged(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four scenarios, the actions of the last two of which are not kept."""
+    path = tmp_path_factory.mktemp("partly") / "result.json"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(protocol, "LOGGED_OF_BUILTIN", 2)
+        protocol.evaluate(request.param, TASK, path, episodes=4)
+    return path
+
+
+def altered(path: Path, folder: Path, scenario: int, policy: str | None = None) -> Path:
+    """A copy in which a scenario ended a hundredth elsewhere, and all else agrees."""
+    copied = Path(shutil.copytree(path.parent, folder / "copy")) / path.name
+    result = result_file.load(copied)
+    rows = list(result.episodes)
+    otherwise = {name: value + 0.01 for name, value in rows[scenario].settled.errors.items()}
+    changed: dict[str, Any] = {
+        "settled": rows[scenario].settled.model_copy(update={"errors": otherwise})
+    }
+    if not rows[scenario].success:
+        changed["errors"] = otherwise
+    rows[scenario] = rows[scenario].model_copy(update=changed)
+    said = result.summary
+    summary = Summary.of(
+        said.task,
+        policy or said.policy,
+        said.split,
+        rows,
+        tolerances=result.metadata.tolerances,
+        time_limit_steps=result.metadata.time_limit_steps,
+    )
+    result_file.write(result.model_copy(update={"episodes": rows, "summary": summary}), copied)
+    return copied
+
+
+def test_a_built_in_policy_plays_again_what_is_not_logged(partly_logged: Path) -> None:
+    result = result_file.load(partly_logged)
+    assert (result.metadata.n_logged, result.summary.n_episodes) == (2, 4)
+    assert len(verification.load_actions(partly_logged, result)) == 2
+    verdict = verification.verify(partly_logged)
+    assert (verdict.n_episodes, verdict.n_played, verdict.n_near) == (4, 4, 0)
+    assert set(verdict.largest.values()) == {0.0}
+    # So do those who look for the reasons of failures, and those who draw clips.
+    lost = sum(not row.success for row in result.episodes)
+    assert len(failures.sort_failures(partly_logged).failures) == lost
+    assert all(row.scenario < 2 for _, row in board_clips.choose(result))
+
+
+@pytest.mark.parametrize("scenario", [1, 3])
+def test_an_altered_row_is_found_whether_it_is_logged_or_not(
+    scenario: int, partly_logged: Path, tmp_path: Path
+) -> None:
+    path = altered(partly_logged, tmp_path, scenario)
+    with pytest.raises(ResultError, match=f"scenario {scenario}: .*error"):
+        verification.verify(path)
+
+
+@pytest.mark.parametrize("policy", ["trapped:make", "hvs_suite_none", "./expert", "finetuned"])
+def test_no_file_names_the_code_that_verifying_runs(
+    policy: str, partly_logged: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "trapped.py").write_text("raise SystemExit('it ran')")
+    monkeypatch.chdir(tmp_path)
+    path = altered(partly_logged, tmp_path, 3, policy)
+    for look in (verification.verify, failures.sort_failures):
+        with pytest.raises(ResultError, match="is no built-in policy, but the action log"):
+            look(path)
 
 
 # --- tampering ----------------------------------------------------------------------------------
@@ -177,8 +305,9 @@ Content = dict[str, Any]
 
 def reseal(content: Content) -> None:
     """What a careful cheat does: summary and seal agree with the altered rows again."""
-    rows = [EpisodeRow.model_validate(row) for row in content["episodes"]]
     summary, metadata = content["summary"], content["metadata"]
+    columns = result_file._rows(content["episodes"], summary["n_episodes"])
+    rows = [EpisodeRow(**{"scenario": k} | row) for k, row in enumerate(columns)]
     content["summary"] = Summary.of(
         summary["task"],
         summary["policy"],
@@ -210,19 +339,24 @@ def edit(name: str, value: Any) -> Callable[[Content, Path], None]:
 
 
 def better_error(content: Content, path: Path) -> None:
-    content["episodes"][1]["position_error_mm"] /= 2
+    content["episodes"]["errors"]["position_error_mm"][1] /= 2
     reseal(content)
 
 
 def better_settled_error(content: Content, path: Path) -> None:
-    content["episodes"][1]["settled_tilt_error_deg"] += 3e-5
+    content["episodes"]["settled"]["errors"]["tilt_error_deg"][1] += 3e-5
     reseal(content)
 
 
+def spread(column: Any) -> list[Any]:
+    """A column of three as a list, be all of it one value or not."""
+    return column if isinstance(column, list) else 3 * [column]
+
+
 def faster(content: Content, path: Path) -> None:
-    row = content["episodes"][0]
-    row["steps"] -= 1
-    row["steps_to_goal"] -= 1
+    for name in ("steps", "steps_to_goal"):
+        content["episodes"][name] = spread(content["episodes"][name])
+        content["episodes"][name][0] -= 1
     reseal(content)
 
 
@@ -269,7 +403,22 @@ def pickled_log(content: Content, path: Path) -> None:
 
 
 def fewer_rows(content: Content, path: Path) -> None:
-    content["episodes"].pop()
+    content["summary"]["n_episodes"] = 2
+    content["metadata"]["n_logged"] = 2
+    content["episodes"] = first_two(content["episodes"])
+    reseal(content)
+
+
+def first_two(columns: Any) -> Any:
+    if isinstance(columns, dict):
+        return {name: first_two(column) for name, column in columns.items()}
+    return columns[:2] if isinstance(columns, list) else columns
+
+
+def without_a_metric(content: Content, path: Path) -> None:
+    """The figure that a board shows first."""
+    for block in (content["episodes"], content["episodes"]["settled"]):
+        del block["errors"]["lateral_error_mm"]
     reseal(content)
 
 
@@ -288,17 +437,18 @@ def resealed(name: str, value: Any) -> Callable[[Content, Path], None]:
 
 TAMPERING: dict[str, tuple[Callable[[Content, Path], None], str]] = {
     "a better error, summary and seal made to fit": (better_error, "scenario 1: position_error"),
-    "a settled error, a hair too far": (better_settled_error, "scenario 1: settled_tilt_error"),
+    "a settled error, a hair too far": (better_settled_error, "scenario 1: settled.tilt_error"),
     "a faster success": (faster, "scenario 0: steps is"),
     "a flattered summary": (edit("summary.pc_success", 99.0), "summary.pc_success is not"),
     "another policy's name": (edit("summary.policy", "mine"), "was changed after it was written"),
     "another action, its hash made to fit": (other_action, "scenario 0: "),
     "another action, its hash as it was": (action_without_hash, "is not the action log"),
     "the actions of other episodes": (other_episodes_actions, "scenario 0: "),
-    "an action left out": (shorter_log, "settled_steps is 20, but 19 actions are logged"),
+    "an action left out": (shorter_log, "settled.steps is 20, but 19 actions are logged"),
     "no action log": (no_log, "cannot be read"),
     "an action log with code in it": (pickled_log, "holds object"),
-    "an episode left out": (fewer_rows, "holds 3 scenarios, the result 2"),
+    "an episode left out": (fewer_rows, "holds 3 scenarios, the result says 2"),
+    "a metric left out": (without_a_metric, "metrics is"),
     "a wider tolerance": (wider_tolerance, "tolerances is"),
     "another version of the task": (resealed("metadata.task_version", 2), "task_version is 2"),
     "another digest of the task": (resealed("metadata.task_digest", "abc"), "task_digest is abc"),

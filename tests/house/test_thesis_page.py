@@ -12,11 +12,10 @@ import pytest
 import hvs_suite
 from hvs_suite.cli.main import COMMANDS
 from hvs_suite.errors import OptionError
-from hvs_suite.tasks.shared.spec import Spec
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "thesis.md"
-FIELDS = {field.name for field in dataclasses.fields(Spec)}
+FIELDS = {field.name for field in dataclasses.fields(hvs_suite.TASKS["align-thesis"])}
 KEYWORDS = set(inspect.signature(hvs_suite.load).parameters)
 
 

@@ -12,7 +12,8 @@ from PIL import Image
 from safetensors.torch import load_file
 
 from hvs_suite.errors import DatasetError, OptionError, OutputError, PolicyError
-from hvs_suite.policies.checkpoint import load_network, read_config
+from hvs_suite.policies.checkpoint import load_network
+from hvs_suite.policies.checkpoint_files import read_config
 from hvs_suite.policies.demonstrations import Demonstrations, calibration_of, read_manifest
 from hvs_suite.policies.pretrain import pretrain
 
@@ -165,7 +166,7 @@ def test_eyes_of_another_policy_are_where_training_begins(dataset, large_dataset
         assert change < 1e-6 or ".eyes." not in name
         assert change > 1e-6 or ".head." not in name or "bias" in name
     assert json.loads((out / "train_config.json").read_text())["settings"]["eyes"]
-    with pytest.raises(PolicyError, match=r"no model\.safetensors"):
+    with pytest.raises(PolicyError, match="not a LeRobot checkpoint"):
         pretrain(dataset, tmp_path / "other", steps=1, eyes=tmp_path)
     with pytest.raises(PolicyError, match="no eyes that fit"):
         pretrain(large_dataset, tmp_path / "large", steps=1, batch_size=4, eyes=learned)

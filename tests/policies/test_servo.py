@@ -11,11 +11,12 @@ import pytest
 import hvs_suite
 from hvs_suite.cell.cameras import extrinsics, intrinsics, look_at, project
 from hvs_suite.cell.kinematics import kinematics
-from hvs_suite.cell.robot import JOINT_SPEED_RAD_S
+from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
 from hvs_suite.errors import PolicyError
 from hvs_suite.policies.catalogue import policy_factory
 from hvs_suite.policies.context import Blindfolded, PolicyContext
-from hvs_suite.policies.servo import Belief, make_servo
+from hvs_suite.policies.servo import make_servo
+from hvs_suite.policies.servo.belief import Belief
 from hvs_suite.policies.servo.target_estimate import (
     DISC_PLANE_M,
     Sighting,
@@ -23,8 +24,8 @@ from hvs_suite.policies.servo.target_estimate import (
     intersect,
 )
 from hvs_suite.policies.servo.target_search import TargetSearch
+from hvs_suite.registry import TASKS
 from hvs_suite.rollout import run_episode
-from hvs_suite.tasks.shared.spec import TASKS
 
 SPLIT = "dev"
 # Neither camera sees the target at the start of this scenario.
@@ -112,13 +113,14 @@ def test_it_copes_with_latency_that_it_is_not_told(latency):
 
 @pytest.mark.parametrize("latency", [0, 1, 2])
 def test_latency_shows_in_when_the_arm_first_moves(latency):
-    belief = Belief(TASKS["align-thesis"])
-    step = JOINT_SPEED_RAD_S * belief.spec.control_period_s
+    period_s = TASKS["align-thesis"].control_period_s
+    belief = Belief(period_s)
+    step = JOINT_SPEED_RAD_S * period_s
     position, set_points = np.zeros(7), []
     for n in range(5):
         belief.measure(position, np.zeros(7))
         set_points.append((n + 1) * 0.5 * step)
-        belief.command(belief.commandable(set_points[-1]))
+        belief.command((set_points[-1] / JOINT_RANGE_RAD).astype(np.float32))
         if n >= latency:
             position = set_points[n - latency]
     belief.measure(position, np.zeros(7))

@@ -50,7 +50,7 @@ def test_lerobot_eval_plays_the_policy_with_the_words_of_the_readme(demo, tmp_pa
     from lerobot.scripts import lerobot_eval
 
     text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
-    [words] = re.findall(r"^lerobot-eval ((?:.*\\\n)*.*)$", text, re.MULTILINE)
+    [words] = re.findall(r"^OMP_NUM_THREADS=1 lerobot-eval ((?:.*\\\n)*.*)$", text, re.MULTILINE)
     words = words.replace("runs/demo/policy", str(demo / "policy")).replace("\\\n", " ")
     monkeypatch.setattr("sys.argv", ["lerobot-eval", *words.split(), f"--output_dir={tmp_path}"])
     # The same line again, short: the parser takes the last word on a subject.

@@ -18,7 +18,7 @@ from hvs_suite.tasks.shared.spec import JOINT_LIMITS_DEG
         ("align-thesi", "did you mean align-thesis"),
         ("algn-hard", "align-hard"),
         ("align_easy", "align-easy"),
-        ("juggle", "choose from align-fixed, align-easy"),
+        ("polish", "choose from align-fixed, align-easy"),
         ("", "choose from"),
     ],
 )
@@ -194,7 +194,8 @@ def test_named_tasks_mean_what_the_table_of_tasks_says() -> None:
     rows = {
         name: (
             v.start, getattr(v, own[v.family]), v.target_diameter_m, v.position_tolerance_mm,
-            v.lateral_tolerance_mm, v.height_tolerance_mm, v.tilt_tolerance_deg, v.hold_steps, v.time_limit_steps,
+            v.lateral_tolerance_mm, v.height_tolerance_mm, v.tilt_tolerance_deg, v.hold_steps,
+            v.time_limit_steps,
         )
         for name, v in tasks.items()
     }  # fmt: skip
@@ -205,7 +206,7 @@ def test_named_tasks_mean_what_the_table_of_tasks_says() -> None:
         "align-hard": ("random", "random", 0.02, 0.5, None, None, 0.5, 3, 40),
         "align-drill": ("random", "random", 0.01, None, 0.25, 1.0, 0.4, 5, 40),
         "align-limit": ("random", "random", 0.02, None, 0.1, 0.3, 0.2, 5, 40),
-        "sequence-thesis": ("zero", 25, 0.05, 1.0, None, None, 1.0, 1, 125),
+        "sequence-thesis": ("zero", 30, 0.05, 1.0, None, None, 1.0, 1, 150),
         "sequence-hard": ("random", 40, 0.02, 0.5, None, None, 0.5, 3, 200),
         "track-line": ("zero", "line", 0.05, 1.0, None, None, 1.0, 20, 60),
         "track-curve": ("zero", "curve", 0.05, 1.0, None, None, 1.0, 20, 60),
