@@ -63,7 +63,9 @@ class TrackSpec(PlacingSpec):
     speed_m_s: tuple[float, float] = scene((0.05, 0.15))
     acceleration_m_s2: float = scene(0.3)
     hold_steps: int = 20
-    time_limit_steps: int = 60
+    # The target has to stay on the ring for as long as the episode lasts.
+    time_limit_steps: int = scene(60)
+    control_period_s: float = scene(0.1)
 
     def __post_init__(self) -> None:
         """Refuse values that make no sense, with a sentence.
