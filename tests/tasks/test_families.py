@@ -180,7 +180,11 @@ def test_what_is_observed_depends_on_scenario_and_step_alone(task: str) -> None:
         ("sequence-thesis", {"ring_m": (0.3, 0.9)}, "use radii from 0.40 to 0.78 m"),
         ("track-line", {"ring_m": (0.3, 0.9)}, "use radii from 0.40 to 0.78 m"),
         ("sequence-thesis", {"n_targets": 0}, "n_targets is 0"),
-        ("sequence-thesis", {"n_targets": 6}, "do not fit into time_limit_steps 125"),
+        (
+            "sequence-thesis",
+            {"n_targets": 6, "target_steps": 30},
+            "do not fit into time_limit_steps",
+        ),
         ("sequence-thesis", {"target_steps": 0}, "target_steps is 0"),
         ("sequence-thesis", {"target_distance_m": 2.0}, "target_distance_m is 2.0"),
         ("sequence-thesis", {"motion": "line"}, "no option 'motion'"),
