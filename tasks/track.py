@@ -67,9 +67,7 @@ class TrackSpec(PlacingSpec):
     acceleration_m_s2: float = scene(0.3)
     motion_s: float = scene(6.0)
     hold_steps: int = 20
-    # The target has to stay on the ring for as long as the episode lasts.
-    time_limit_steps: int = scene(60)
-    control_period_s: float = scene(0.1)
+    time_limit_steps: int = 60
 
     def __post_init__(self) -> None:
         """Refuse values that make no sense, with a sentence.
