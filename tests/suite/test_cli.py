@@ -20,6 +20,11 @@ TASKS = (
     "align-hard",
     "align-drill",
     "align-limit",
+    "sequence-thesis",
+    "sequence-hard",
+    "track-line",
+    "track-curve",
+    "track-hard",
 )
 
 
