@@ -24,7 +24,6 @@ TASKS = (
     "sequence-hard",
     "track-line",
     "track-curve",
-    "track-hard",
 )
 
 
