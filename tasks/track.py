@@ -150,7 +150,7 @@ class Motion:
         return -self._waves(np.sin, np.asarray(time_s, np.float64)[..., None], 2)
 
     def _waves(self, wave: np.ufunc, time: FloatArray, derivative: int) -> FloatArray:
-        height = self.amplitude * self.omega**derivative
+        height: FloatArray = self.amplitude * self.omega**derivative
         return np.asarray((height * wave(self.omega * time[..., None] + self.phase)).sum(axis=-2))
 
 

@@ -1,7 +1,6 @@
 """``hvs demo``: the whole pipeline once, small enough to wait for."""
 
 import dataclasses
-import json
 import shutil
 from pathlib import Path
 
@@ -103,12 +102,14 @@ class Demo:
 
     def _report(self, result: Path, board: Path, times_s: dict[str, float]) -> None:
         """Print the policy's success as it is, where everything lies, and what it took."""
-        summary = json.loads(result.read_text(encoding="utf-8"))["summary"]
-        low, high = summary["pc_success_ci95"]
+        from hvs_suite.eval import result_file
+
+        summary = result_file.load(result).summary
+        low, high = summary.pc_success_ci95
         console.print_times(times_s)
         print(
-            f"{self.task}, the demo's own policy: {summary['n_success']} of "
-            f"{summary['n_episodes']} solved, {summary['pc_success']:.1f} % "
+            f"{self.task}, the demo's own policy: {summary.n_success} of "
+            f"{summary.n_episodes} solved, {summary.pc_success:.1f} % "
             f"(95 % interval {low:.1f} to {high:.1f} %)"
         )
         for what, path in (
@@ -123,8 +124,10 @@ class Demo:
 
 def _solved_scenario(result: Path) -> int:
     """The first scenario of a result that was solved, 0 if none was."""
-    rows = json.loads(result.read_text(encoding="utf-8"))["episodes"]
-    return next((int(row["scenario"]) for row in rows if row["success"]), 0)
+    from hvs_suite.eval import result_file
+
+    rows = result_file.load(result).episodes
+    return next((row.scenario for row in rows if row.success), 0)
 
 
 def film_one(policy: Path, task: str, scenario: int, film: Path) -> None:

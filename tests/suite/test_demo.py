@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from hvs_suite.cli.main import run
+from hvs_suite.eval import result_file
 
 EPISODES, EVALUATIONS = 3, 2
 
@@ -39,10 +40,9 @@ def test_demo_trains_a_policy_that_plain_from_pretrained_loads(demo):
 
 
 def test_demo_scores_that_policy_as_it_is(demo):
-    result = json.loads((demo / "results" / "demo" / "align-easy.json").read_text())
-    assert result["summary"]["task"] == "align-easy"
-    assert result["summary"]["n_episodes"] == EVALUATIONS
-    assert len(result["episodes"]) == EVALUATIONS
+    result = result_file.load(demo / "results" / "demo" / "align-easy.json")
+    assert result.summary.task == "align-easy"
+    assert len(result.episodes) == EVALUATIONS
 
 
 @pytest.mark.timeout(300)
