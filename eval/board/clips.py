@@ -22,9 +22,9 @@ import numpy as np
 
 from hvs_suite import files, reading, registry
 from hvs_suite.errors import OutputError, ResultError
-from hvs_suite.eval import action_log, result_file, trial
-from hvs_suite.eval.result_file import EpisodeRow, Result
-from hvs_suite.eval.submission import Submission
+from hvs_suite.eval.board.submission import Submission
+from hvs_suite.eval.scoring import action_log, result_file, trial
+from hvs_suite.eval.scoring.result_file import EpisodeRow, Result
 from hvs_suite.rollout import Action, Observation
 
 if TYPE_CHECKING:

@@ -5,9 +5,9 @@ import urllib.parse
 from collections.abc import Sequence
 
 from hvs_suite import registry
-from hvs_suite.eval import board_clips, board_plots
-from hvs_suite.eval.board_clips import Clip
-from hvs_suite.eval.board_tables import (
+from hvs_suite.eval.board import plots
+from hvs_suite.eval.board.clips import SIZE, Clip
+from hvs_suite.eval.board.tables import (
     DASH,
     SUCCESS,
     Entry,
@@ -16,7 +16,7 @@ from hvs_suite.eval.board_tables import (
     iqm_interval,
     joined,
 )
-from hvs_suite.eval.result_file import Metadata
+from hvs_suite.eval.scoring.result_file import Metadata
 from hvs_suite.names import shown
 from hvs_suite.tasks.shared.goal import LATERAL, POSITION
 from hvs_suite.tasks.shared.metric import Metric
@@ -74,7 +74,7 @@ def _films(entry: Entry, clips: Sequence[Clip]) -> str:
     """Both clips; lazily, so that a closed sheet decodes nothing."""
     if not clips:
         return ""
-    width, height = board_clips.SIZE
+    width, height = SIZE
     films = []
     for clip in clips:
         row = clip.row
@@ -106,8 +106,8 @@ def _landings(entry: Entry) -> str:
     tolerance = sideways(entry)
     if tolerance is None:
         return ""
-    radius = board_plots.landing_radius(rows)
-    outside = sum(not board_plots.is_inside(row, radius) for row in rows)
+    radius = plots.landing_radius(rows)
+    outside = sum(not plots.is_inside(row, radius) for row in rows)
     caption = "Where the flange stands around the target at the time limit, seen along the normal. "
     caption += (
         f"The circle is the tolerance, {tolerance:g} mm."
@@ -116,7 +116,7 @@ def _landings(entry: Entry) -> str:
     )
     if outside:
         caption += f" So do {outside} of {len(rows)} landings."
-    plot = board_plots.landing_plot(rows, radius, tolerance, "Landings around the target")
+    plot = plots.landing_plot(rows, radius, tolerance, "Landings around the target")
     return (
         f'<figure class="wide">{plot}<figcaption>{caption}<span class="key">'
         '<i class="hit"></i>solved<i class="miss"></i>not solved<i class="lost"></i>arm lost'

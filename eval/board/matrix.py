@@ -4,8 +4,8 @@ import itertools
 from collections.abc import Mapping, Sequence
 
 from hvs_suite import statistics
-from hvs_suite.eval.board_tables import DASH, Entry, escaped
-from hvs_suite.eval.comparison import SIGNIFICANT, Tally
+from hvs_suite.eval.board.tables import DASH, Entry, escaped
+from hvs_suite.eval.scoring.comparison import SIGNIFICANT, Tally
 
 CAPTION = (
     "Success of the row's policy minus the column's, in percentage points, on the scenarios that "

@@ -1,8 +1,8 @@
 """Names on the board that are ours, and the actions of the results that may bear them.
 
-``ours.json`` beside this file holds the SHA-256 of the action log of each ``<policy>/<task>`` that
+``eval/ours.json`` holds the SHA-256 of the action log of each ``<policy>/<task>`` that
 the suite's own policies stand on the board with. A submission does not touch it. After they were
-scored anew, ``python -m hvs_suite.eval.ours`` writes it from ``eval/results``.
+scored anew, ``python -m hvs_suite.eval.board.ours`` writes it from ``eval/results``.
 """
 
 import json
@@ -10,11 +10,11 @@ from pathlib import Path
 
 from hvs_suite import files, names, reading
 from hvs_suite.errors import ResultError
-from hvs_suite.eval import action_log
-from hvs_suite.eval.result_file import Result
+from hvs_suite.eval.scoring import action_log
+from hvs_suite.eval.scoring.result_file import Result
 from hvs_suite.policies import catalogue
 
-FILE = Path(__file__).resolve().with_name("ours.json")
+FILE = Path(__file__).resolve().parents[1] / "ours.json"
 
 
 def check(path: Path, result: Result) -> None:

@@ -1,7 +1,7 @@
 """Draws the board as one web page: no network, sortable, readable on a phone and in the dark.
 
 Everything is in the file: style, script, plots and clips. The style and the script lie beside this
-module as ``board.css`` and ``board.js``.
+module as ``page.css`` and ``page.js``.
 """
 
 import importlib.resources
@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 
 from markdown_it import MarkdownIt
 
-from hvs_suite.eval import board_entry, board_matrix, board_plots
-from hvs_suite.eval.board_clips import Clip
-from hvs_suite.eval.board_tables import (
+from hvs_suite.eval.board import entry_sheet, matrix, plots
+from hvs_suite.eval.board.clips import Clip
+from hvs_suite.eval.board.tables import (
     DASH,
     DRAFT,
     MEANS,
@@ -49,7 +49,7 @@ def page(
     colours = {policy: k for k, policy in enumerate(sorted({e.policy for e in entries}))}
     sections = "\n".join(_section(task, table, colours) for task, table in tables.items())
     sheets = "\n".join(
-        board_entry.sheet(entry, (clips or {}).get((entry.policy, entry.result.summary.task), ()))
+        entry_sheet.sheet(entry, (clips or {}).get((entry.policy, entry.result.summary.task), ()))
         for table in tables.values()
         for entry in table
     )
@@ -66,7 +66,7 @@ def page(
 style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:">
 <title>hvs_suite leaderboard</title>
 <style>
-{_resource("board.css")}</style>
+{_resource("board/page.css")}</style>
 </head>
 <body>
 <main>
@@ -92,7 +92,7 @@ aria-label="Search policies" autocomplete="off"><nav aria-label="Tasks">{links}
 </main>
 {sheets}
 <script>
-{_resource("board.js")}</script>
+{_resource("board/page.js")}</script>
 </body>
 </html>
 """
@@ -110,7 +110,7 @@ def _overall(rows: Sequence[Overall], tasks: Sequence[str], colours: Mapping[str
         cells = [
             f'<td data-value="{row.mean!r}"><b>{percent(row.mean)}</b>'
             f"<small>{interval(row.low, row.high)}</small>"
-            f"{board_plots.bar(row.low, row.mean, row.high)}</td>",
+            f"{plots.bar(row.low, row.mean, row.high)}</td>",
             f'<td data-value="{row.n_families}">{row.coverage}</td>',
         ]
         cells += [_overall_cell(row.entries.get(task)) for task in tasks]
@@ -128,7 +128,7 @@ def _overall_cell(entry: Entry | None) -> str:
     if entry is None:
         return f'<td data-value="">{DASH}</td>'
     return (
-        f'<td data-value="{SUCCESS.value(entry)!r}"><a href="{board_entry.link(entry)}">'
+        f'<td data-value="{SUCCESS.value(entry)!r}"><a href="{entry_sheet.link(entry)}">'
         f"{SUCCESS.text(entry)}</a><small>{SUCCESS.interval(entry)}</small>{_bar(entry)}</td>"
     )
 
@@ -157,7 +157,7 @@ def _section(task: str, table: Sequence[Entry], colours: dict[str, int]) -> str:
 </tbody></table></div>
 <div class="plots">
 {_against_tolerance(table, colours)}
-<figure>{board_plots.steps_plot(table, colours)}
+<figure>{plots.steps_plot(table, colours)}
 <figcaption>Success against time: solved within so many control steps.</figcaption></figure>
 </div>
 {_legend(table, colours)}
@@ -170,14 +170,14 @@ def _against_tolerance(table: Sequence[Entry], colours: dict[str, int]) -> str:
     """Returns the curve of success against tolerance; nothing where a tolerance is 0."""
     if table[0].result.summary.settled.success_by_scale is None:
         return ""
-    return f"""<figure>{board_plots.tolerance_plot(table, colours)}
+    return f"""<figure>{plots.tolerance_plot(table, colours)}
 <figcaption>Success against tolerance, where the episodes end. 1 is the task's own tolerance;
 shaded, the pointwise 95 % intervals.</figcaption></figure>"""
 
 
 def _landings(table: Sequence[Entry]) -> str:
     """Returns where the policies of a task land; nothing where it goes on past its last goal."""
-    tolerance = board_entry.sideways(table[0])
+    tolerance = entry_sheet.sideways(table[0])
     if tolerance is None:
         return ""
     return f"""<h3>Where they land</h3>
@@ -189,9 +189,7 @@ the tolerance.</p>
 def _pairs(table: Sequence[Entry]) -> str:
     if len(table) < 2:
         return ""
-    return (
-        f"<h3>Each with each</h3><p>{escaped(board_matrix.CAPTION)}</p>{board_matrix.matrix(table)}"
-    )
+    return f"<h3>Each with each</h3><p>{escaped(matrix.CAPTION)}</p>{matrix.matrix(table)}"
 
 
 def _head(columns: Sequence[tuple[str, bool]], sorted_by: int) -> str:
@@ -209,7 +207,7 @@ def _row(entry: Entry, shown: Sequence[Column], colour: int) -> str:
     cells = "".join(_figure(column, entry) for column in shown)
     return (
         f'<tr data-policy="{name}"><th scope="row" data-value="{name}">{_swatch(colour)}'
-        f'<a href="{board_entry.link(entry)}">{name}</a></th>{cells}</tr>'
+        f'<a href="{entry_sheet.link(entry)}">{name}</a></th>{cells}</tr>'
     )
 
 
@@ -239,8 +237,8 @@ def _figure(column: Column, entry: Entry) -> str:
 
 def _landing(entry: Entry, tolerance: float) -> str:
     rows = entry.result.episodes
-    inside = sum(board_plots.is_inside(row, 2 * tolerance) for row in rows)
-    plot = board_plots.landing_plot(
+    inside = sum(plots.is_inside(row, 2 * tolerance) for row in rows)
+    plot = plots.landing_plot(
         rows, 2 * tolerance, tolerance, f"Landings of {entry.policy} around the target"
     )
     name = escaped(entry.policy)
@@ -262,13 +260,13 @@ def _legend(table: Sequence[Entry], colours: Mapping[str, int]) -> str:
 
 
 def _swatch(colour: int) -> str:
-    broken = " broken" if colour >= board_plots.COLOURS else ""
-    return f'<i class="swatch c{colour % board_plots.COLOURS}{broken}"></i>'
+    broken = " broken" if colour >= plots.COLOURS else ""
+    return f'<i class="swatch c{colour % plots.COLOURS}{broken}"></i>'
 
 
 def _bar(entry: Entry) -> str:
     low, high = entry.result.summary.pc_success_ci95
-    return board_plots.bar(low, entry.result.summary.pc_success, high)
+    return plots.bar(low, entry.result.summary.pc_success, high)
 
 
 def _submitting() -> str:

@@ -13,8 +13,8 @@ from typing import Final
 import numpy as np
 
 from hvs_suite import statistics
-from hvs_suite.eval.board_tables import Entry, escaped, figure
-from hvs_suite.eval.result_file import EpisodeRow
+from hvs_suite.eval.board.tables import Entry, escaped, figure
+from hvs_suite.eval.scoring.result_file import EpisodeRow
 
 # A curve's plot in user units; shown at about 1.3 px a unit on a desktop, 1 px on a phone.
 _WIDTH, _HEIGHT = 360, 232

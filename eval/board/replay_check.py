@@ -16,8 +16,8 @@ import pydantic
 
 from hvs_suite import files, reading
 from hvs_suite.errors import OptionError, ResultError
-from hvs_suite.eval import verification
-from hvs_suite.eval.submission import Submission
+from hvs_suite.eval.board.submission import Submission
+from hvs_suite.eval.scoring import verification
 
 SAMPLE: Final = 20
 """Scenarios of a new result that a build plays: a second a result, and one altered row in ten does

@@ -14,10 +14,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from hvs_suite.errors import ResultError
-from hvs_suite.eval import result_file
-from hvs_suite.eval.result_file import Result
-from hvs_suite.eval.submission import Submission
-from hvs_suite.eval.verification import check_task
+from hvs_suite.eval.board.submission import Submission
+from hvs_suite.eval.scoring import result_file
+from hvs_suite.eval.scoring.result_file import Result
+from hvs_suite.eval.scoring.verification import check_task
 
 
 def check(submissions: Sequence[Submission], folder: Path) -> dict[str, Result]:

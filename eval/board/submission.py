@@ -9,10 +9,11 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from hvs_suite.errors import ResultError
-from hvs_suite.eval import action_log, ours, result_file
-from hvs_suite.eval.action_log import Actions
-from hvs_suite.eval.result_file import Result
-from hvs_suite.eval.verification import check_task, load_actions
+from hvs_suite.eval.board import ours
+from hvs_suite.eval.scoring import action_log, result_file
+from hvs_suite.eval.scoring.action_log import Actions
+from hvs_suite.eval.scoring.result_file import Result
+from hvs_suite.eval.scoring.verification import check_task, load_actions
 from hvs_suite.names import check_name
 from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
 

@@ -6,8 +6,8 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 
 from hvs_suite import registry, statistics
-from hvs_suite.eval.result_file import Result, SettledErrorSummary
-from hvs_suite.eval.submission import Submission
+from hvs_suite.eval.board.submission import Submission
+from hvs_suite.eval.scoring.result_file import Result, SettledErrorSummary
 from hvs_suite.names import shown
 from hvs_suite.registry import TASKS
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from hvs_suite import reading, registry, statistics
 from hvs_suite.errors import ResultError
-from hvs_suite.eval import lerobot_import, result_file
-from hvs_suite.eval.result_file import EpisodeRow
+from hvs_suite.eval.scoring import lerobot_import, result_file
+from hvs_suite.eval.scoring.result_file import EpisodeRow
 from hvs_suite.statistics import Difference
 
 SIGNIFICANT = 0.05

@@ -9,7 +9,7 @@ from typing import Literal
 
 from hvs_suite import registry
 from hvs_suite.errors import PolicyError
-from hvs_suite.eval import provenance
+from hvs_suite.eval.scoring import provenance
 from hvs_suite.policies.catalogue import policy_factory
 from hvs_suite.policies.context import Blindfolded
 from hvs_suite.policies.imported import ImportedFactory

@@ -14,7 +14,7 @@ import pydantic
 
 from hvs_suite import files, reading, registry, statistics
 from hvs_suite.errors import ResultError
-from hvs_suite.eval.result_file import MOST_BYTES
+from hvs_suite.eval.scoring.result_file import MOST_BYTES
 from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
 
 LEROBOT_SEED = 1000

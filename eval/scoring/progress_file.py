@@ -21,8 +21,8 @@ import pydantic
 
 from hvs_suite import files
 from hvs_suite.errors import OutputError
-from hvs_suite.eval.result_file import EpisodeRow
-from hvs_suite.eval.trial import Trial
+from hvs_suite.eval.scoring.result_file import EpisodeRow
+from hvs_suite.eval.scoring.trial import Trial
 
 SUFFIX = ".partial"
 _SALT_BYTES = 16

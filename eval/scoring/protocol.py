@@ -12,16 +12,10 @@ from typing import Any
 
 from hvs_suite import files, registry, rollout
 from hvs_suite.errors import OptionError, ScenarioError
-from hvs_suite.eval import (
-    action_log,
-    contender,
-    policy_process,
-    progress_file,
-    provenance,
-    result_file,
-)
-from hvs_suite.eval.contender import Contender
-from hvs_suite.eval.trial import DECISION_LIMIT_S, PlayTrial, Trial, check_decision_limit
+from hvs_suite.eval.scoring import action_log, contender, progress_file, provenance, result_file
+from hvs_suite.eval.scoring.contender import Contender
+from hvs_suite.eval.scoring.trial import DECISION_LIMIT_S, PlayTrial, Trial, check_decision_limit
+from hvs_suite.eval.serving import policy_process
 from hvs_suite.tasks.shared import lock
 from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
 

@@ -13,7 +13,7 @@ import pydantic
 
 from hvs_suite.cell import gl
 from hvs_suite.errors import PolicyError
-from hvs_suite.policies.checkpoint_files import MOST_SETTINGS_BYTES, home, read_shapes
+from hvs_suite.policies.checkpoints.files import MOST_SETTINGS_BYTES, home, read_shapes
 from hvs_suite.reading import read_bytes
 
 # Whatever can change a physics state, a picture, or a policy's answer to it.

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.errors import OptionError, describe
-from hvs_suite.eval.result_file import EpisodeRow, Settled
+from hvs_suite.eval.scoring.result_file import EpisodeRow, Settled
 from hvs_suite.rollout import Action, Observation, Policy, library_seeds
 
 NOT_FINITE = "not finite"

@@ -17,8 +17,8 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from hvs_suite.errors import HvsError, PolicyError
-from hvs_suite.eval import policy_session, wire
-from hvs_suite.eval.remote_policy import RemotePolicy, hello
+from hvs_suite.eval.serving import policy_session, wire
+from hvs_suite.eval.serving.remote_policy import RemotePolicy, hello
 from hvs_suite.rollout import WORKER_ENVIRONMENT
 
 ENDED = "process ended"
@@ -27,7 +27,7 @@ _STDERR = 2
 
 
 class PolicyProcess:
-    """A process that has a `hvs_suite.eval.policy_session.Session`; a `remote_policy.Line` to it.
+    """A process that has a `policy_session.Session`; a `remote_policy.Line` to it.
 
     It and all that it started end when this object goes, or the process that holds it.
 

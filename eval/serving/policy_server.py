@@ -21,8 +21,8 @@ from websockets.protocol import State
 from websockets.sync.server import Server, ServerConnection, serve
 
 from hvs_suite.errors import OptionError
-from hvs_suite.eval import wire
-from hvs_suite.eval.policy_process import PolicyProcess
+from hvs_suite.eval.serving import wire
+from hvs_suite.eval.serving.policy_process import PolicyProcess
 
 MAX_CONNECTIONS = 32
 """Each has a process with a policy of its own."""

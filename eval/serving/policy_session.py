@@ -17,8 +17,9 @@ import numpy as np
 from dm_env import specs
 
 from hvs_suite.errors import HvsError, PolicyError, ServerError, describe
-from hvs_suite.eval import contender, wire
-from hvs_suite.eval.contender import Contender
+from hvs_suite.eval.scoring import contender
+from hvs_suite.eval.scoring.contender import Contender
+from hvs_suite.eval.serving import wire
 from hvs_suite.policies.context import PolicyContext
 from hvs_suite.registry import TASKS
 from hvs_suite.rollout import Policy, library_seeds, one_torch_thread

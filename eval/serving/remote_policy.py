@@ -21,11 +21,10 @@ from websockets.uri import parse_uri
 
 from hvs_suite import registry
 from hvs_suite.errors import HvsError, OptionError, ServerError
-from hvs_suite.eval import wire
-from hvs_suite.eval.contender import Contender
-from hvs_suite.eval.provenance import suite_version
-from hvs_suite.eval.result_file import Count, Seconds
-from hvs_suite.eval.trial import (
+from hvs_suite.eval.scoring.contender import Contender
+from hvs_suite.eval.scoring.provenance import suite_version
+from hvs_suite.eval.scoring.result_file import Count, Seconds
+from hvs_suite.eval.scoring.trial import (
     DECISION_LIMIT_S,
     TOO_SLOW,
     WRONG_SHAPE,
@@ -33,6 +32,7 @@ from hvs_suite.eval.trial import (
     EpisodeLostError,
     check_decision_limit,
 )
+from hvs_suite.eval.serving import wire
 from hvs_suite.rollout import Action, Observation
 from hvs_suite.tasks.shared import lock
 

@@ -15,10 +15,10 @@ from typing import Any
 import pydantic
 
 from hvs_suite.errors import OptionError
-from hvs_suite.eval.comparison import Tally
-from hvs_suite.eval.result_file import Result
-from hvs_suite.eval.study_training import SPLIT, Report, earlier_result, train_and_judge
-from hvs_suite.policies.demonstrations import read_manifest
+from hvs_suite.eval.scoring.comparison import Tally
+from hvs_suite.eval.scoring.result_file import Result
+from hvs_suite.eval.studies.training import SPLIT, Report, earlier_result, train_and_judge
+from hvs_suite.policies.imitation.demonstrations import read_manifest
 from hvs_suite.registry import find
 
 WHOLE = "everything"

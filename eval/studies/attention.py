@@ -9,8 +9,8 @@ import torch
 
 from hvs_suite.errors import PolicyError
 from hvs_suite.pictures import GREEN, Picture, as_rgb, resize, strip
-from hvs_suite.policies.checkpoint import load_network
-from hvs_suite.policies.checkpoint_files import read_config
+from hvs_suite.policies.checkpoints.files import read_config
+from hvs_suite.policies.checkpoints.loading import load_network
 from hvs_suite.policies.hvs.network import HvsNetwork, Sighting
 from hvs_suite.rollout import Action, Observation, Policy, one_torch_thread, run_episode
 

@@ -24,8 +24,9 @@ from hvs_suite.datasets.publication import Encoding, check_encoding, convert_to_
 from hvs_suite.datasets.reader import Picture
 from hvs_suite.datasets.recompression import VideoCopy
 from hvs_suite.errors import DatasetError, OptionError, OutputError
-from hvs_suite.eval.comparison import Tally
-from hvs_suite.eval.compression_figures import (
+from hvs_suite.eval.scoring.comparison import Tally
+from hvs_suite.eval.scoring.result_file import Result
+from hvs_suite.eval.studies.compression_figures import (
     Answers,
     CameraFigures,
     FloatArray,
@@ -34,11 +35,10 @@ from hvs_suite.eval.compression_figures import (
     Success,
     located,
 )
-from hvs_suite.eval.result_file import Result
-from hvs_suite.eval.study_training import Report, earlier_result, train_and_judge
+from hvs_suite.eval.studies.training import Report, earlier_result, train_and_judge
 from hvs_suite.files import check_writable, replacing
-from hvs_suite.policies.demonstrations import read_manifest, refuse_test_split
-from hvs_suite.policies.frame_cache import fingerprint
+from hvs_suite.policies.imitation.demonstrations import read_manifest, refuse_test_split
+from hvs_suite.policies.imitation.frame_cache import fingerprint
 from hvs_suite.registry import find
 
 LOSSLESS = "PNG"

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from hvs_suite.eval.compression_figures import CameraFigures, Row, Spread, Study
+from hvs_suite.eval.studies.compression_figures import CameraFigures, Row, Spread, Study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

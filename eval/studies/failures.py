@@ -19,12 +19,12 @@ import torch
 from hvs_suite import registry
 from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.errors import ResultError
-from hvs_suite.eval import result_file, verification
-from hvs_suite.eval.result_file import EpisodeRow
-from hvs_suite.eval.trial import play_trial
+from hvs_suite.eval.scoring import result_file, verification
+from hvs_suite.eval.scoring.result_file import EpisodeRow
+from hvs_suite.eval.scoring.trial import play_trial
 from hvs_suite.names import shown
-from hvs_suite.policies.checkpoint import load_network, network_inputs
-from hvs_suite.policies.checkpoint_files import read_config
+from hvs_suite.policies.checkpoints.files import read_config
+from hvs_suite.policies.checkpoints.loading import load_network, network_inputs
 from hvs_suite.rollout import Action, Observation, one_torch_thread
 from hvs_suite.tasks.shared.spec import Spec
 

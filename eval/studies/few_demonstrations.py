@@ -23,11 +23,11 @@ from typing import Annotated, Any
 import pydantic
 
 from hvs_suite.errors import OptionError, OutputError
-from hvs_suite.eval.comparison import Tally
-from hvs_suite.eval.result_file import Result
-from hvs_suite.eval.study_training import Report, earlier_result, judge
+from hvs_suite.eval.scoring.comparison import Tally
+from hvs_suite.eval.scoring.result_file import Result
+from hvs_suite.eval.studies.training import Report, earlier_result, judge
 from hvs_suite.files import replacing
-from hvs_suite.policies.demonstrations import read_manifest
+from hvs_suite.policies.imitation.demonstrations import read_manifest
 from hvs_suite.rollout import worker_conditions
 
 BASE = "base"
@@ -375,7 +375,7 @@ class _Maker:
 
     def base(self, count: int, seed: int) -> Result:
         """Clone some demonstrations."""
-        from hvs_suite.policies.pretrain import pretrain
+        from hvs_suite.policies.imitation.pretrain import pretrain
 
         def train(policy: Path, note: Note) -> None:
             pretrain(
@@ -422,7 +422,7 @@ class _Maker:
 
     def imitated(self, count: int, seed: int) -> tuple[list[Point], Result, float]:
         """Let the expert label every step instead."""
-        from hvs_suite.policies.pretrain import pretrain
+        from hvs_suite.policies.imitation.pretrain import pretrain
 
         budget = self.budget
         frames = budget.env_steps // budget.imitation_rounds

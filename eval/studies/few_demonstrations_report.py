@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from hvs_suite.eval.few_demonstrations import (
+from hvs_suite.eval.studies.few_demonstrations import (
     BASE,
     FINETUNED,
     IMITATED,
@@ -12,7 +12,7 @@ from hvs_suite.eval.few_demonstrations import (
     Point,
     Study,
 )
-from hvs_suite.eval.study_training import SPLIT
+from hvs_suite.eval.studies.training import SPLIT
 from hvs_suite.statistics import mean_rate_interval
 
 COLOURS = {FINETUNED: "#e9620a", IMITATED: "#2b6cb0", SCRATCH: "#7a3fa0"}

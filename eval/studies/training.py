@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from hvs_suite.errors import ResultError
-from hvs_suite.eval import protocol, result_file
-from hvs_suite.eval.result_file import Result
+from hvs_suite.eval.scoring import protocol, result_file
+from hvs_suite.eval.scoring.result_file import Result
 
 Report = Callable[[str, float, str], None]
 """Takes a stage, the share of it that is done (0 to 1) and a few words."""
@@ -65,7 +65,7 @@ def train_and_judge(
     Returns:
         The result.
     """
-    from hvs_suite.policies.pretrain import pretrain
+    from hvs_suite.policies.imitation.pretrain import pretrain
 
     policy = run / "policy"
     pretrain(

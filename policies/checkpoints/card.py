@@ -12,8 +12,8 @@ from typing import Any
 
 from hvs_suite.errors import PolicyError, first_line
 from hvs_suite.files import replacing
-from hvs_suite.policies.checkpoint_files import FILES, read_config
-from hvs_suite.policies.training_plot import PICTURE
+from hvs_suite.policies.checkpoints.files import FILES, read_config
+from hvs_suite.policies.training.plot import PICTURE
 from hvs_suite.registry import find
 from hvs_suite.tasks.shared.goal import POSITION
 

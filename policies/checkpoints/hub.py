@@ -2,7 +2,7 @@
 
 The Hub's own client does the work: it keeps what it fetched, works offline from there
 (``HF_HUB_OFFLINE=1``), and lets ``HF_ENDPOINT`` name another server. Only settings and weights are
-fetched. Settings may name code, see `hvs_suite.policies.checkpoint_files`, which refuses those.
+fetched. Settings may name code, see `hvs_suite.policies.checkpoints.files`, which refuses those.
 """
 
 import contextlib

@@ -9,8 +9,8 @@ from safetensors.torch import save
 
 from hvs_suite.errors import PolicyError
 from hvs_suite.files import replacing
-from hvs_suite.policies.checkpoint import NETWORK_PREFIX, STANDARD_STEPS, load_network
-from hvs_suite.policies.checkpoint_files import read_config
+from hvs_suite.policies.checkpoints.files import read_config
+from hvs_suite.policies.checkpoints.loading import NETWORK_PREFIX, STANDARD_STEPS, load_network
 from hvs_suite.policies.hvs.network import HvsNetwork
 
 

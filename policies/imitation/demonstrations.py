@@ -18,16 +18,16 @@ from hvs_suite.datasets import reader
 from hvs_suite.datasets.features import ACTION, ACTION_EXECUTED, dataset_features
 from hvs_suite.datasets.metadata import read_metadata
 from hvs_suite.errors import DatasetError, OptionError, UnknownTaskError
-from hvs_suite.policies.frame_cache import (
+from hvs_suite.policies.hvs.geometry import Calibration, calibrate
+from hvs_suite.policies.hvs.network import IMAGE_PREFIX, MEMORY, N_JOINTS, STATE
+from hvs_suite.policies.imitation.frame_cache import (
     Frames,
     OnFrames,
     cached_frames,
     data_files,
     read_rows,
 )
-from hvs_suite.policies.hvs.geometry import Calibration, calibrate
-from hvs_suite.policies.hvs.network import IMAGE_PREFIX, MEMORY, N_JOINTS, STATE
-from hvs_suite.policies.remembered import remembered
+from hvs_suite.policies.imitation.remembered import remembered
 from hvs_suite.registry import find
 from hvs_suite.tasks.shared.placing import PlacingSpec
 

@@ -19,26 +19,26 @@ import torch
 
 from hvs_suite.errors import OptionError, PolicyError
 from hvs_suite.files import replacing
-from hvs_suite.policies.allocator import keep_freed_memory
-from hvs_suite.policies.checkpoint import weights_digest
-from hvs_suite.policies.curves import Curves
-from hvs_suite.policies.dagger import RoundSummary, play_round, read_round, round_shares
-from hvs_suite.policies.demonstrations import (
+from hvs_suite.policies.checkpoints.loading import weights_digest
+from hvs_suite.policies.imitation.dagger import RoundSummary, play_round, read_round, round_shares
+from hvs_suite.policies.imitation.demonstrations import (
     Demonstrations,
     Manifest,
     read_manifest,
     refuse_test_split,
 )
-from hvs_suite.policies.frame_cache import fingerprint
-from hvs_suite.policies.pretrain_settings import (
+from hvs_suite.policies.imitation.frame_cache import fingerprint
+from hvs_suite.policies.imitation.settings import (
     Settings,
     new_policy,
     take_eyes,
     tightest_scale,
 )
-from hvs_suite.policies.run_folder import claimed, write_train_config
-from hvs_suite.policies.training_plot import draw_run
-from hvs_suite.policies.training_state import Counters, load_state, save_state
+from hvs_suite.policies.imitation.state import Counters, load_state, save_state
+from hvs_suite.policies.training.allocator import keep_freed_memory
+from hvs_suite.policies.training.curves import Curves
+from hvs_suite.policies.training.plot import draw_run
+from hvs_suite.policies.training.run_folder import claimed, write_train_config
 
 if TYPE_CHECKING:
     from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy, Lesson
