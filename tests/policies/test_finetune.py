@@ -117,7 +117,7 @@ def sent(folder):
 def test_a_residual_adds_nothing_at_first_and_no_more_than_its_bound_ever(base, tmp_path):
     plain = load_base(base)
     network = with_residual(plain, hidden=16, bound=0.6)
-    write_folded(base, network, tmp_path / "folded")
+    write_folded(base, network, tmp_path / "folded", hvs_suite.TASKS["align-easy"])
     np.testing.assert_allclose(sent(tmp_path / "folded"), sent(base), atol=1e-6)
     with torch.no_grad():
         network.residual[-2].bias.fill_(100.0)
