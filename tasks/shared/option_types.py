@@ -83,8 +83,7 @@ def to_text(value: Any) -> str:
         value: Of an option; lists, as JSON gives them, do for tuples.
     """
     if isinstance(value, list | tuple):
-        # One item alone would be read as no list.
-        return ",".join(map(to_text, value)) + "," * (len(value) == 1)
+        return ",".join(map(to_text, value))
     return str(value).lower() if value is None or isinstance(value, bool) else str(value)
 
 
