@@ -45,6 +45,7 @@ class Certify:
         import hvs_suite
         from hvs_suite.registry import family_of, find
         from hvs_suite.tasks.shared import certificate, lock
+        from hvs_suite.tasks.shared.option_types import listed
         from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
 
         if self.workers < 1:
@@ -53,9 +54,9 @@ class Certify:
         options = {task: find(task).options_from_text(self.option) for task in asked}
         # All are held against the lock first: certifying takes minutes a task.
         entries: dict[str, lock.LockEntry | None] = {}
-        for task, changed in options.items():
+        for task in options:
             entries[task] = None
-            if lock.is_own(task) and not changed:
+            if lock.is_own(task) and not options[task]:
                 with hvs_suite.load(task, split=TEST_SPLIT) as env:
                     entries[task] = lock.agreed_entry(env)
         failed = False
@@ -64,8 +65,9 @@ class Certify:
             digest = lock.digest(task) if entry is None else entry.digest
             with console.progress(f"certify {task}", n) as advance:
                 found = certify(task, options[task], digest, TEST_SCENARIOS, self.workers, advance)
+            changed = listed(options[task])
             console.print_table(
-                (title(found), "found", "needed", ""),
+                (title(found) + (f", with {changed}" if changed else ""), "found", "needed", ""),
                 [(c.what, c.found, c.needed, verdict(c)) for c in found.checks],
             )
             if not found.holds:

@@ -440,3 +440,9 @@ def test_what_cannot_be_fine_tuned_is_refused(whole, base, tmp_path, capsys):
     assert run(["finetune", *words]) == 2
     assert "does not fit align-easy" in capsys.readouterr().err
     assert not (tmp_path / "cli").exists()
+
+
+def test_the_options_of_the_run_are_in_checkpoint_and_notes(whole):
+    out, _, _ = whole
+    assert json.loads((out / "config.json").read_text())["options"] == OPTIONS
+    assert json.loads((out / "train_config.json").read_text())["settings"]["options"] == OPTIONS
