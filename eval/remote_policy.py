@@ -318,8 +318,8 @@ def find(
     url: str,
     name: str,
     task: str,
-    options: Mapping[str, Any] = AS_NAMED,
     decision_limit_s: float = DECISION_LIMIT_S,
+    options: Mapping[str, Any] = AS_NAMED,
 ) -> Contender:
     """Asks a server who it is.
 
@@ -327,8 +327,8 @@ def find(
         url: Of the server, ``ws://host:port``.
         name: What the result shall call the policy.
         task: Named task.
-        options: Options that it is played with, where they differ from it.
         decision_limit_s: Time after which a decision loses the episode (s).
+        options: Options that it is played with, where they differ from it.
 
     Returns:
         The policy; hash, parameters and training are the server's own word.

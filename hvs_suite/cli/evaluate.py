@@ -84,7 +84,7 @@ class Evaluate:
             return contender.find(self.policy, task, options)
         from hvs_suite.eval import remote_policy
 
-        return remote_policy.find(self.server, self.policy, task, options, self.decision_limit)
+        return remote_policy.find(self.server, self.policy, task, self.decision_limit, options)
 
     def _evaluate(
         self, task: str, path: Path, contender: "Contender", options: Mapping[str, Any]

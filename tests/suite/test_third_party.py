@@ -142,7 +142,7 @@ def test_it_goes_from_demonstrations_to_a_board_by_the_commands_of_the_page(
     named = run("-c", _NAMES, "runs/results", path=installed, cwd=tmp_path)
     assert named.returncode == 0, named.stderr
     # Who has not installed the package is told which task is missing.
-    for words in ("check runs/shelf", "verify runs/results", "pretrain --data runs/shelf --out p"):
+    for words in ("check runs/shelf", "verify runs/results"):
         alone = hvs(*words.split(), path=tmp_path, cwd=tmp_path)
         assert alone.returncode != 0
         assert "shelf-easy" in alone.stdout + alone.stderr
@@ -154,7 +154,6 @@ def test_a_module_goes_to_a_board_without_being_installed(tmp_path: Path) -> Non
     (tmp_path / MODULE.name).write_bytes(MODULE.read_bytes())
     for line in (
         "record --task shelf-easy --episodes 2 --noise 0.02 --workers 2 --out data",
-        "check data",
         "evaluate --policy zero --task shelf-easy --episodes 2 --workers 2 "
         "--out results/zero/shelf-easy.json",
         "verify results --workers 2",
