@@ -15,7 +15,6 @@ from hvs_suite.files import replacing
 from hvs_suite.policies.checkpoint_files import FILES, read_config
 from hvs_suite.policies.training_plot import PICTURE
 from hvs_suite.registry import find
-from hvs_suite.tasks.shared.goal import POSITION
 from hvs_suite.tasks.shared.option_types import listed
 
 CARD = "README.md"
@@ -190,22 +189,23 @@ def _results(results: list[Mapping[str, Any]]) -> list[str]:
     if not results:
         return ["Not scored yet: see `hvs evaluate`.", ""]
     lines = [
-        "| task | split | solved | 95 % interval | collisions | steps | settled error, mm |",
+        "| task | split | solved | 95 % interval | collisions | steps | settled |",
         "|---|---|---|---|---|---|---|",
     ]
     for result in sorted(results, key=lambda each: str(each["summary"]["task"])):
         summary = result["summary"]
+        spec = find(summary["task"])
+        [metric] = (m for m in spec.metrics if m.name == spec.headline[0])
         low, high = summary["pc_success_ci95"]
         steps = summary["steps_to_goal_mean"]
-        # Where every episode ends with the task, nothing settles.
-        settled = summary["settled"]["errors"].get(POSITION)
+        settled = summary["settled"]["errors"][metric.name]["iqm"]
         changed = listed(result["metadata"]["options"])
         played = f"`{summary['task']}`" + (f" with `{changed}`" if changed else "")
         lines.append(
             f"| {played} | `{summary['split']}` | {summary['n_success']:,} of "
             f"{summary['n_episodes']:,} ({summary['pc_success']:.1f} %) | {low:.1f} to {high:.1f} "
             f"% | {summary['n_collision']} | {'-' if steps is None else f'{steps:.1f}'} | "
-            f"{'-' if settled is None else format(settled['iqm'], '.3f')} |"
+            f"{metric.title} {settled:.3f} {metric.unit} |"
         )
     return [*lines, ""]
 

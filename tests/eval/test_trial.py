@@ -318,7 +318,9 @@ def test_on_a_full_disk_nothing_is_lost(
     assert size < n_bytes
     words = f"evaluate --policy random --task {TASK} --episodes 4 --out {full}".split()
     code = (
-        "import resource, sys; from hvs_suite.cli.main import main\n"
+        # Not the disk of the output: where the robot is read from.
+        "import resource, sys; from hvs_suite.cell.kinematics import kinematics; kinematics()\n"
+        "from hvs_suite.cli.main import main\n"
         f"resource.setrlimit(resource.RLIMIT_FSIZE, ({n_bytes}, {n_bytes})); main(sys.argv[1:])"
     )
     done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True)

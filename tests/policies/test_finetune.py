@@ -360,9 +360,7 @@ def test_a_fine_tuned_policy_is_shipped_like_any_other(whole, tmp_path):
      ([0.9, 0.6, 0.88], False)],
 )  # fmt: skip
 def test_success_has_fallen_where_chance_does_not_explain_it(rates, expected):
-    evaluations = [
-        Evaluation(i, i, 100, 0.0, 1.0, rate, 0.0, 0.0, 0.0) for i, rate in enumerate(rates)
-    ]
+    evaluations = [Evaluation(i, i, 100, 0.0, 1.0, rate, 0.0, {}) for i, rate in enumerate(rates)]
     assert fallen(evaluations) is expected
 
 
@@ -371,7 +369,7 @@ def pretend(monkeypatch, rates):
     coming = iter(rates)
 
     def evaluate(self, policy, env_steps, updates, clip=None, on_episode=None):
-        return Evaluation(env_steps, updates, 100, 0.0, 1.0, next(coming), 0.0, 0.0, 0.0)
+        return Evaluation(env_steps, updates, 100, 0.0, 1.0, next(coming), 0.0, {})
 
     monkeypatch.setattr("hvs_suite.policies.rl.evaluation.Examiner.evaluate", evaluate)
 
