@@ -17,13 +17,12 @@ from hvs_suite.datasets.features import dataset_features
 from hvs_suite.datasets.metadata import (
     METADATA_FILE,
     DatasetMetadata,
-    jsonable,
     read_metadata,
     write_metadata,
 )
 from hvs_suite.errors import DatasetError, HvsError, OptionError, OutputError, ScenarioError
 from hvs_suite.names import check_name
-from hvs_suite.registry import find
+from hvs_suite.registry import find, options_of
 from hvs_suite.rollout import play
 from hvs_suite.tasks.shared.lock import digest
 
@@ -103,7 +102,7 @@ def record(
         task=task,
         task_version=spec.version,
         split=split,
-        options=jsonable(options or {}),
+        options=options_of(spec),
         noise=float(noise),
         command=command,
         task_digest=digest(task),
@@ -122,7 +121,7 @@ def record(
         fps = round(1.0 / spec.control_period_s)
         writer = DatasetWriter(root, features, fps, spec.instruction(), block)
         played = play(
-            MakeEnvironment(task, split, dict(options or {})),
+            MakeEnvironment(task, split, metadata.options),
             make_demonstrator,
             range(len(outcomes), episodes),
             Demonstrate(noise),

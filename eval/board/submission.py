@@ -13,7 +13,7 @@ from hvs_suite.eval.board import ours
 from hvs_suite.eval.scoring import action_log, result_file
 from hvs_suite.eval.scoring.action_log import Actions
 from hvs_suite.eval.scoring.result_file import Result
-from hvs_suite.eval.scoring.verification import check_task, load_actions
+from hvs_suite.eval.scoring.verification import check_as_named, check_task, load_actions
 from hvs_suite.names import check_name
 from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
 
@@ -115,6 +115,7 @@ def _check_alone(path: Path, result: Result, results: Path, *, draft: bool) -> N
     check_name(path.parent.name, f"{path}: the folder's name", error=ResultError)
     check_name(result.summary.policy, f"{path}: summary.policy", error=ResultError)
     _check_place(path, result, results)
+    check_as_named(path, result)
     check_task(path, result)
     if not draft:
         _check_score(path, result)

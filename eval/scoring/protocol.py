@@ -1,4 +1,7 @@
-"""How a policy is scored: scenarios 0..N-1 of a split, the task as named, every episode a row."""
+"""How a policy is scored: scenarios 0..N-1 of a split, the task as named, every episode a row.
+
+Studies may change the task by options; the result says so, and is no score then.
+"""
 
 import contextlib
 import dataclasses
@@ -6,7 +9,7 @@ import datetime
 import hashlib
 import random
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +19,7 @@ from hvs_suite.eval.scoring import action_log, contender, progress_file, provena
 from hvs_suite.eval.scoring.contender import Contender
 from hvs_suite.eval.scoring.trial import DECISION_LIMIT_S, PlayTrial, Trial, check_decision_limit
 from hvs_suite.eval.serving import policy_process
+from hvs_suite.policies import catalogue
 from hvs_suite.tasks.shared import lock
 from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
 
@@ -27,21 +31,24 @@ Progress = Callable[[Trial], None]
 
 @dataclasses.dataclass(frozen=True)
 class MakeTask:
-    """Builds a named task in whichever process asks for it.
+    """Builds a task in whichever process asks for it.
 
     Attributes:
         task: Named task.
         split: Split its scenarios come from.
+        options: Options that differ from it.
         pictures: Draw the observations; a re-simulation needs none.
     """
 
     task: str
     split: str
+    options: Mapping[str, Any]
     pictures: bool = True
 
     def __call__(self) -> rollout.Environment:
         """Returns a new environment."""
-        options: dict[str, Any] = {} if self.pictures else {"observations": "state"}
+        unseen = {} if self.pictures else {"observations": "state"}
+        options = {**self.options, **unseen}
         env: rollout.Environment = registry.load(self.task, split=self.split, **options)
         return env
 
@@ -53,6 +60,7 @@ def evaluate(
     *,
     split: str = TEST_SPLIT,
     episodes: int = TEST_SCENARIOS,
+    options: Mapping[str, Any] = catalogue.AS_NAMED,
     workers: int = 1,
     decision_limit_s: float = DECISION_LIMIT_S,
     progress: Progress | None = None,
@@ -64,12 +72,15 @@ def evaluate(
     come in an order drawn for this run: no policy learns by counting which one it plays.
 
     Args:
-        policy: What `hvs_suite.policies.catalogue.policy_factory` takes, or a contender.
-        task: Named task, played as named.
+        policy: What `hvs_suite.policies.catalogue.policy_factory` takes, or a contender that was
+            found for the task and the options.
+        task: Named task.
         out: Result file to write (JSON); the action log and, meanwhile, what is already played
             stand beside it. None writes nothing.
         split: Split to play; ``test`` for a score, any other name for a look.
         episodes: Scenarios to play: 0 to `episodes` - 1.
+        options: Options of the task that differ from the named one, for studies; only the task as
+            named is a score.
         workers: Processes; the episodes are the same for any number.
         decision_limit_s: Time after which a decision loses its episode (s).
         progress: Called after each episode, in the order in which they end; at once for those that
@@ -82,7 +93,8 @@ def evaluate(
         UnknownTaskError: There is no such task.
         PolicyError: There is no such policy, or it does not fit the task.
         ScenarioError: The split does not hold that many scenarios.
-        OptionError: `episodes` or `workers` is below 1, or the time limit is no time limit.
+        OptionError: `episodes` or `workers` is below 1, the time limit is no time limit, or an
+            option of the task makes no sense.
         OutputError: The result cannot be written, another process is writing it, or the beginning
             of another one is in its place.
         RenderError: Nothing here can draw the images.
@@ -98,8 +110,11 @@ def evaluate(
             f"split {TEST_SPLIT!r} holds {TEST_SCENARIOS} scenarios, not {episodes}; ask for "
             f"{TEST_SCENARIOS} episodes or fewer"
         )
-    spec = registry.find(task)
-    player = contender.find(policy, task) if isinstance(policy, str) else policy
+    spec = registry.find(task).with_options(options)
+    options = registry.options_of(spec)
+    if spec.action_mode == "flange_twist":
+        raise OptionError("action_mode=flange_twist has six numbers; an action log holds seven")
+    player = contender.find(policy, task, options) if isinstance(policy, str) else policy
     make = player.make
     if player.kind == "module":
         make = policy_process.ProcessFactory(player.name, str(Path.cwd()), task, decision_limit_s)
@@ -108,6 +123,7 @@ def evaluate(
         "schema_version": result_file.SCHEMA_VERSION,
         "task": task,
         "task_digest": lock.digest(task),
+        "options": options,
         "split": split,
         "policy": player.name,
         "policy_kind": player.kind,
@@ -127,7 +143,7 @@ def evaluate(
         wall_s = _play_rest(
             kept,
             rollout.play(
-                MakeTask(task, split),
+                MakeTask(task, split, options),
                 make,
                 [index for index in order if index not in kept.trials],
                 PlayTrial(decision_limit_s, kept.salt),
@@ -138,7 +154,8 @@ def evaluate(
         trials = [kept.trials[index] for index in range(episodes)]
         rows = [trial.row for trial in trials]
         actions = [trial.actions for trial in trials]
-        n_logged = min(LOGGED_OF_BUILTIN, episodes) if player.kind == "builtin" else episodes
+        plays_again = player.kind == "builtin" and not options
+        n_logged = min(LOGGED_OF_BUILTIN, episodes) if plays_again else episodes
         log = action_log.encode(actions[:n_logged])
         steps = sum(map(len, actions))
         result = result_file.Result(
@@ -158,7 +175,7 @@ def evaluate(
                 task_digest=lock.digest(task),
                 tolerances=spec.tolerances,
                 time_limit_steps=spec.time_limit_steps,
-                options={},
+                options=options,
                 policy_kind=player.kind,
                 policy_hash=player.hash,
                 policy_parameters=player.parameters,

@@ -442,6 +442,8 @@ class Result(_Block):
         n_logged, kind = self.metadata.n_logged, self.metadata.policy_kind
         if n_logged > len(self.episodes) or (n_logged < len(self.episodes) and kind != "builtin"):
             raise ValueError("metadata.n_logged must be the number of rows")
+        if n_logged < len(self.episodes) and self.metadata.options:
+            raise ValueError("metadata.n_logged must be the number of rows where there are options")
         ours = self.summary
         theirs = Summary.of(
             ours.task,

@@ -38,6 +38,8 @@ class Bench:
         recording: Measure recording instead: its rate against bare simulation.
         episodes: Episodes that the expert plays or that are recorded.
         json: Print the figures as JSON.
+        option: Parameter of the task to change for a study, such as target_diameter_m=0.03; give it
+            several times for several.
     """
 
     task: str | None = None
@@ -46,6 +48,7 @@ class Bench:
     recording: bool = False
     episodes: int = 600
     json: bool = False
+    option: tuple[str, ...] = ()
 
     def run(self) -> None:
         """Measure and print."""
@@ -54,51 +57,53 @@ class Bench:
         demonstrations = self.expert or self.recording
         if self.task is None and not demonstrations:
             raise OptionError("say what to measure: --task, such as --task align-easy")
+        from hvs_suite.registry import find
+        from hvs_suite.tasks.shared.option_types import listed
+
         task = self.task or "align-thesis"
+        options = find(task).options_from_text(self.option)
         figures: dict[str, float] = {}
         labels: dict[str, str] = {}
         if demonstrations:
-            self._check_episodes(task)
+            self._check_episodes()
         if self.expert:
             from hvs_suite.cli import bench_expert
 
-            figures |= bench_expert.expert_figures(task, self.episodes)
+            figures |= bench_expert.expert_figures(task, options, self.episodes)
             labels |= bench_expert.LABELS
         if self.recording:
             from hvs_suite.cli import bench_recording
 
-            figures |= bench_recording.recording_figures(task, self.episodes, self.seconds)
+            figures |= bench_recording.recording_figures(task, options, self.episodes, self.seconds)
             labels |= bench_recording.LABELS
         if not demonstrations:
-            figures, labels = self._simulation(task), LABELS
+            figures, labels = self._simulation(task, options), LABELS
         if self.json:
             console.print_json(
-                {"task": task} | {name: round(value, 3) for name, value in figures.items()}
+                {"task": task, "options": options}
+                | {name: round(value, 3) for name, value in figures.items()}
             )
             return
         console.print_table(
-            (task, "measured"),
+            (f"{task} with {listed(options)}" if options else task, "measured"),
             [(label, f"{figures[name]:.2f}") for name, label in labels.items()],
         )
 
-    def _check_episodes(self, task: str) -> None:
+    def _check_episodes(self) -> None:
         """Refuse counts that say nothing or go beyond the test split."""
-        from hvs_suite.registry import find
-
-        find(task)
         if not 2 <= self.episodes <= 1000:
             raise OptionError(f"--episodes is {self.episodes}; use 2 to 1000")
 
-    def _simulation(self, task: str) -> dict[str, float]:
+    def _simulation(self, task: str, options: Mapping[str, Any]) -> dict[str, float]:
         """How fast the task steps."""
         import hvs_suite
 
-        with hvs_suite.load(task) as env:
+        with hvs_suite.load(task, **options) as env:
             figures = against_bare_loop(env, self.seconds)
-        with hvs_suite.load(task, observations="state") as env:
+        with hvs_suite.load(task, **{**options, "observations": "state"}) as env:
             steps, elapsed_s, _ = play(env, self.seconds / 2)
             figures["steps_per_s_no_cameras"] = steps / elapsed_s
-        return figures | with_workers(task, self.seconds)
+        return figures | with_workers(task, options, self.seconds)
 
 
 LABELS = {
@@ -320,18 +325,19 @@ def play(env: "Environment", seconds: float) -> tuple[int, float, int]:
     return steps, elapsed_s, episodes
 
 
-def with_workers(task: str, seconds: float) -> dict[str, float]:
+def with_workers(task: str, options: Mapping[str, Any], seconds: float) -> dict[str, float]:
     """Compare two worker processes with one, in turns.
 
     Args:
         task: A named task.
+        options: Options of it.
         seconds: How long to measure one, and two (s).
 
     Returns:
         ``one_worker_steps_per_s``, ``two_worker_steps_per_s`` and ``two_worker_speedup``.
     """
     one, two = [], []
-    with _worker(task) as first, _worker(task) as second:
+    with _worker(task, options) as first, _worker(task, options) as second:
         for _ in range(WORKER_ROUNDS):
             one.append(_rate([first], seconds / WORKER_ROUNDS))
             two.append(_rate([first, second], seconds / WORKER_ROUNDS))
@@ -342,23 +348,24 @@ def with_workers(task: str, seconds: float) -> dict[str, float]:
     }
 
 
-def two_worker_rate(task: str, seconds: float) -> float:
+def two_worker_rate(task: str, options: Mapping[str, Any], seconds: float) -> float:
     """Steps per second of two worker processes together.
 
     Args:
         task: A named task.
+        options: Options of it.
         seconds: How long to measure (s).
     """
-    with _worker(task) as first, _worker(task) as second:
+    with _worker(task, options) as first, _worker(task, options) as second:
         return _rate([first, second], seconds)
 
 
 @contextlib.contextmanager
-def _worker(task: str) -> Iterator[Connection]:
+def _worker(task: str, options: Mapping[str, Any]) -> Iterator[Connection]:
     """A process that plays a task whenever it is sent a duration."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=_work, args=(task, theirs), daemon=True)
+    process = context.Process(target=_work, args=(task, options, theirs), daemon=True)
     process.start()
     theirs.close()
     try:
@@ -370,11 +377,11 @@ def _worker(task: str) -> Iterator[Connection]:
             process.kill()
 
 
-def _work(task: str, connection: Connection) -> None:
+def _work(task: str, options: Mapping[str, Any], connection: Connection) -> None:
     """Body of a worker process: answers each duration with the steps per second it reached."""
     import hvs_suite
 
-    with hvs_suite.load(task) as env, contextlib.suppress(EOFError, KeyboardInterrupt):
+    with hvs_suite.load(task, **options) as env, contextlib.suppress(EOFError, KeyboardInterrupt):
         while True:
             steps, elapsed_s, _ = play(env, connection.recv())
             connection.send(steps / elapsed_s)

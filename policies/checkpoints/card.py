@@ -15,6 +15,7 @@ from hvs_suite.files import replacing
 from hvs_suite.policies.checkpoints.files import FILES, read_config
 from hvs_suite.policies.training.plot import PICTURE
 from hvs_suite.registry import find
+from hvs_suite.tasks.shared.option_types import listed
 
 CARD = "README.md"
 LICENCE = "apache-2.0"
@@ -98,7 +99,7 @@ def describe(
     words = spec.describe()
     named = f"`{settings['task']}`"
     if options:
-        named += " with " + ", ".join(f"`{k}={v!r}`" for k, v in sorted(options.items()))
+        named += f" with `{listed(options)}`"
     rows = {
         "trained on": f"{named}, split `train` alone",
         "task": f"{spec.instruction()} Target: {words.target}; within {words.tolerance}",
@@ -198,8 +199,10 @@ def _results(results: list[Mapping[str, Any]]) -> list[str]:
         low, high = summary["pc_success_ci95"]
         steps = summary["steps_to_goal_mean"]
         settled = summary["settled"]["errors"][metric.name]["iqm"]
+        changed = listed(result["metadata"]["options"])
+        played = f"`{summary['task']}`" + (f" with `{changed}`" if changed else "")
         lines.append(
-            f"| `{summary['task']}` | `{summary['split']}` | {summary['n_success']:,} of "
+            f"| {played} | `{summary['split']}` | {summary['n_success']:,} of "
             f"{summary['n_episodes']:,} ({summary['pc_success']:.1f} %) | {low:.1f} to {high:.1f} "
             f"% | {summary['n_collision']} | {'-' if steps is None else f'{steps:.1f}'} | "
             f"{metric.title} {settled:.3f} {metric.unit} |"
