@@ -30,7 +30,8 @@ class Submission:
     Attributes:
         path: ``<results>/<policy>/<task>.json``.
         result: What it holds.
-        executed: Its actions, as `action_log.executed` gives them.
+        executed: Its actions up to where each scenario was scored, as `action_log.executed` gives
+            them.
     """
 
     path: Path
@@ -68,9 +69,10 @@ def check(
         result = result_file.load(path)
         if path.resolve() in wanted:
             _check_alone(path, result, results, draft=draft)
-        actions = load_actions(path, result)
+        log = load_actions(path, result)
+        scored = [actions[: row.steps] for actions, row in zip(log, result.episodes, strict=False)]
         entry = Submission(
-            path, result, action_log.executed(actions, result.metadata.time_limit_steps)
+            path, result, action_log.executed(scored, result.metadata.time_limit_steps)
         )
         for other in standing:
             if path.resolve() in wanted:

@@ -75,6 +75,11 @@ def a_step_of_its_own(folder: Path) -> str:
     return copied(folder, lambda actions: np.concatenate([actions[:-1], -actions[-1:]]))
 
 
+def its_own_once_the_goal_is_held(folder: Path) -> str:
+    # The expert takes up to 14 of the 20 steps; what it did later gave no score.
+    return copied(folder, lambda actions: np.concatenate([actions[:14], actions[14:] + 0.01]))
+
+
 def stored_uncompressed(folder: Path) -> str:
     copied(folder, lambda actions: actions)
     path = folder / "mine" / "align-fixed.json"
@@ -193,6 +198,7 @@ def another_split(folder: Path) -> str:
         shifted_by_a_rounding,
         shifted_out_of_range,
         a_step_of_its_own,
+        its_own_once_the_goal_is_held,
         stored_uncompressed,
         calls_itself_builtin,
         calls_itself("expert"),
