@@ -15,6 +15,7 @@ import numpy.typing as npt
 import pinocchio as pin
 
 from hvs_suite.cell import robot
+from hvs_suite.errors import OutputError
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -120,15 +121,26 @@ class Kinematics:
     """Pinocchio's view of the cell's robot; configurations are (7,) in rad, A1 to A7.
 
     Not for use by several threads at once: Pinocchio's buffers are shared between calls.
+
+    Raises:
+        OutputError: There is no room for a temporary file.
     """
 
     def __init__(self) -> None:
         # Pinocchio reads MJCF from a file only.
-        with tempfile.TemporaryDirectory() as folder:
-            path = pathlib.Path(folder, "iiwa7.xml")
-            path.write_text(robot.robot_mjcf(), encoding="utf-8")
-            self.model = pin.buildModelFromMJCF(str(path))
-            self.geometry = pin.buildGeomFromMJCF(self.model, str(path), pin.GeometryType.COLLISION)
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                path = pathlib.Path(folder, "iiwa7.xml")
+                path.write_text(robot.robot_mjcf(), encoding="utf-8")
+                self.model = pin.buildModelFromMJCF(str(path))
+                self.geometry = pin.buildGeomFromMJCF(
+                    self.model, str(path), pin.GeometryType.COLLISION
+                )
+        except OSError as error:
+            raise OutputError(
+                f"cannot write a temporary file of 10 kB: {error.strerror}; make room, or name "
+                "another folder in TMPDIR"
+            ) from error
         if self.model.nq != len(robot.JOINT_NAMES):
             raise RuntimeError("Pinocchio read no robot from the cell's MJCF")
         self._flange = self.model.getFrameId("flange")
