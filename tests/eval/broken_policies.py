@@ -139,16 +139,13 @@ def curious(context: PolicyContext) -> Holds:
 
 def _truth() -> Iterator[str]:
     """Whatever tells more than the observations: all that Python shows to anybody who looks."""
-    simulator = (
-        "mujoco",
-        "dm_control",
-        "hvs_suite.tasks.shared.environment",
-        "hvs_suite.tasks.shared.scenario",
-    )
+    simulator = ("mujoco", "dm_control", "hvs_suite.tasks.shared.environment")
     yield from (name for name in sys.modules if name.startswith(simulator))
     for thing in gc.get_objects():
         kind = type(thing)
-        if str(getattr(kind, "__module__", "")).startswith(simulator):
+        # How scenarios are drawn anybody can read; one that was drawn is another matter.
+        module = str(getattr(kind, "__module__", ""))
+        if module.startswith((*simulator, "hvs_suite.tasks.shared.scenario")):
             yield f"a {kind.__module__}.{kind.__qualname__}"
         if kind is dict and type(thing.get("scenario")) is int:
             yield "a scenario's index"
