@@ -333,7 +333,7 @@ def find(url: str, name: str, task: str, decision_limit_s: float = DECISION_LIMI
     check_decision_limit(decision_limit_s)
     try:
         parse_uri(url)
-    except InvalidURI as error:
+    except (InvalidURI, ValueError) as error:
         raise OptionError(
             f"--server takes an address such as ws://127.0.0.1:8765, not {url!r}"
         ) from error
