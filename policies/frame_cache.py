@@ -88,7 +88,10 @@ def cached_frames(
             kept = open_frames(path)
             if [*kept.shape] == stamp["shape"] and kept.dtype == np.uint8:
                 return kept
-    made_from.unlink(missing_ok=True)
+    try:
+        made_from.unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot replace {made_from}: {error.strerror}") from error
     frames: Any = new_frames(path, (n_frames, *shape))
     done = 0
     for stored in _stored(root, key):
@@ -136,7 +139,8 @@ def new_frames(path: Path, shape: Sequence[int]) -> Frames:
             with path.open("r+b") as file:
                 os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
     except OSError as error:
-        path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            path.unlink()
         size = int(np.prod(shape, dtype=np.int64)) / 1e6
         raise OutputError(
             f"cannot write {path}: {error.strerror or error}; it takes {size:.1f} MB"

@@ -123,6 +123,13 @@ def bears(name: str) -> Callable[[Path], str]:
     return bear
 
 
+def bears_another_s_name(folder: Path) -> str:
+    made_to_wander(folder)
+    (folder / "mine").rename(folder / "robo")
+    shutil.copytree(folder / "robo", folder / "r\u043ebo")
+    return "passes for"
+
+
 def the_experts_own_elsewhere(folder: Path) -> str:
     (folder / "expert").rename(folder / "mine")
     return "lies in the folder expert"
@@ -207,6 +214,8 @@ def another_split(folder: Path) -> str:
         bears("expert"),
         bears("Expert"),
         bears("e\u0445pert"),
+        bears("e\u00d7pert"),
+        bears_another_s_name,
         the_experts_own_elsewhere,
         a_link,
         a_linked_log,

@@ -225,6 +225,12 @@ def test_frames_that_were_spoilt_are_decoded_anew(dataset, tmp_path, spoil):
         spoil(path)
         again = cached_frames(dataset, camera, shape, n, tmp_path)
         np.testing.assert_array_equal(again, frames)
+        path.unlink()
+        path.mkdir()
+        with pytest.raises(OutputError, match="cannot"):
+            cached_frames(dataset, camera, shape, n, tmp_path)
+        path.rmdir()
+        cached_frames(dataset, camera, shape, n, tmp_path)
 
 
 @pytest.mark.timeout(60)
