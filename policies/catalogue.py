@@ -1,6 +1,7 @@
 """Finds policies by name: baselines, shipped weights, a checkpoint here or on the Hub, own code."""
 
 import difflib
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -66,7 +67,8 @@ def checkpoint_folder(spec: str, task: str) -> Path:
                 f"this version ships no {spec} weights for {task}; train your own with {command}"
             )
         return folder
-    if Path(spec).is_dir():
+    # Unlike pathlib's, this is just False for a name that cannot be.
+    if os.path.isdir(spec):
         return Path(spec)
     if hub.NAME.fullmatch(spec):
         return hub.fetch(spec)

@@ -9,6 +9,7 @@ import contextlib
 import dataclasses
 import hashlib
 import math
+import os
 import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -339,7 +340,8 @@ def results_in(paths: Sequence[Path]) -> list[Path]:
     for path in paths:
         if not path.exists():
             raise OptionError(f"{path} does not exist; name a result file or a folder of them")
-        found += sorted(path.rglob("*.json")) if path.is_dir() else [path]
+        below = [Path(folder, name) for folder, _, names in os.walk(path) for name in names]
+        found += sorted(f for f in below if f.suffix == ".json") if path.is_dir() else [path]
     if not found:
         raise OptionError("there are no results there; name a result file or a folder of them")
     return found

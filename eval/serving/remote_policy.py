@@ -342,7 +342,7 @@ def find(
     check_decision_limit(decision_limit_s)
     try:
         parse_uri(url)
-    except InvalidURI as error:
+    except (InvalidURI, ValueError) as error:
         raise OptionError(
             f"--server takes an address such as ws://127.0.0.1:8765, not {url!r}"
         ) from error

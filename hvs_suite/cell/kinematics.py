@@ -121,6 +121,9 @@ class Kinematics:
     """Pinocchio's view of the cell's robot; configurations are (7,) in rad, A1 to A7.
 
     Not for use by several threads at once: Pinocchio's buffers are shared between calls.
+
+    Raises:
+        OutputError: There is no room for a temporary file.
     """
 
     def __init__(self) -> None:
@@ -135,8 +138,8 @@ class Kinematics:
                 )
         except OSError as error:
             raise OutputError(
-                f"cannot write a temporary file: {error.strerror}; let TMPDIR name a folder with "
-                "room for it"
+                f"cannot write a temporary file of 10 kB: {error.strerror}; make room, or name "
+                "another folder in TMPDIR"
             ) from error
         if self.model.nq != len(robot.JOINT_NAMES):
             raise RuntimeError("Pinocchio read no robot from the cell's MJCF")

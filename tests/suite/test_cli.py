@@ -135,6 +135,22 @@ def test_words_that_make_no_sense_are_refused_in_one_line(words, reason, capsys)
     assert reason in refusal(capsys, *words)
 
 
+EVALUATE = "evaluate --task align-fixed --episodes 1 --out {folder}/r.json"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        f"{EVALUATE} --policy {'x' * 5000}",
+        f"{EVALUATE} --policy me --server ws://localhost:99999",
+        "serve --policy zero --host \u202e",
+        f"serve --policy zero --host {'x' * 300}",
+    ],
+)
+def test_what_the_system_cannot_even_look_for_is_refused_in_one_line(words, tmp_path, capsys):
+    refusal(capsys, *words.format(folder=tmp_path).split())
+
+
 @pytest.mark.parametrize(
     "words",
     [
