@@ -18,7 +18,7 @@ from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared.family import Progress, register
 from hvs_suite.tasks.shared.goal import POSITION, TILT, Goal
 from hvs_suite.tasks.shared.metric import Metric
-from hvs_suite.tasks.shared.placing import UP, Placing, PlacingSpec
+from hvs_suite.tasks.shared.placing import HARD, UP, Placing, PlacingSpec
 from hvs_suite.tasks.shared.scenario import Scenario, Streams, draw_look
 from hvs_suite.tasks.shared.spec import Description, scene
 
@@ -302,4 +302,16 @@ register(
     Track,
     _LINE,
     dataclasses.replace(_LINE, name="track-curve", motion="curve"),
+    dataclasses.replace(
+        _LINE,
+        name="track-hard",
+        motion="curve",
+        start="random",
+        target_diameter_m=0.020,
+        tilt_tolerance_deg=0.5,
+        time_limit_steps=80,
+        motion_s=8.0,
+        latency_steps=1,
+        **HARD,
+    ),
 )

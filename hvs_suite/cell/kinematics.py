@@ -332,6 +332,22 @@ class Kinematics:
         q[:, 6] = tool_angle
         return _within_ranges(q)
 
+    def goal_shapes(
+        self, position: npt.ArrayLike, normal: npt.ArrayLike, n_swivel: int
+    ) -> FloatArray:
+        """The family of a goal at yaw 0, row by row the same elbow places and shapes for any goal.
+
+        Args:
+            position: Flange face centre (3,) in m.
+            normal: Outward surface normal (3,).
+            n_swivel: Evenly spaced elbow places over the circle.
+
+        Returns:
+            (8 n_swivel, 7) in rad, joint ranges not checked, angles within [-pi, pi); empty where
+            the goal is out of reach.
+        """
+        return self._shapes(position, normal, _circle(n_swivel))
+
     def nearest_configuration(
         self, q: FloatArray, position: FloatArray, normal: FloatArray, weight: FloatArray
     ) -> FloatArray | None:
