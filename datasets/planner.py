@@ -23,7 +23,7 @@ import numpy.typing as npt
 import ruckig
 
 from hvs_suite.cell import robot
-from hvs_suite.cell.kinematics import Kinematics, kinematics
+from hvs_suite.cell.kinematics import Kinematics, away_from_stops, kinematics
 from hvs_suite.tasks.shared.goal import Goal
 
 FloatArray = npt.NDArray[np.float64]
@@ -43,6 +43,11 @@ TIE_BREAK_S = 0.01
 LEAD_S = 0.025
 """How far the set point runs ahead of the motion (s): a little less than the joints' lag, tuned for
 the fewest steps. More overshoots the goal, less arrives late."""
+
+_CROWDED_SHARE = 0.5
+_ROOM_S = 1.5
+"""Where more goals follow, what a joint at its stop costs (s), against the way back from there; a
+joint within `_CROWDED_SHARE` of its range costs nothing, between the price goes with the square."""
 
 PLAIN_SWIVELS = 1
 """The elbow straight above: two postures within reach, as a rule."""
@@ -67,10 +72,6 @@ _FREE_RANGE_RAD = robot.JOINT_RANGE_RAD[:6] - math.radians(8.0)
 """A posture in which a joint goes beyond this is not one to follow in."""
 _SPEED_SHARE = 0.7
 """Nor is one that takes more than this share of a joint's speed."""
-_DRIFT_RANGE_RAD = math.radians(30.0)
-_DRIFT_RAD = 0.05
-"""Following, a joint at its stop is pushed back by so much a control step, as far as the goal lets
-it; less the farther away it is, and nothing from `_DRIFT_RANGE_RAD` on."""
 _N_ONWARD_SWIVEL = 36
 _ONWARD_SLACK_S = 0.2
 """A posture whose way on takes this much longer than the shortest way on is not chosen."""
@@ -136,6 +137,7 @@ class Planner:
         self._goal_key: bytes = b""
         self._family: FloatArray = np.empty((7, 1))
         """The goal's configurations, one a column; the last is kept free."""
+        self._more_follow = False
         self._floor_m = 0.0
         self._clearance_m = 0.0
         """Of the present state."""
@@ -165,6 +167,7 @@ class Planner:
         """
         self._look_around(q, goal)
         self._remember_goal(goal)
+        self._more_follow = goal.more_follow
         family = self._reachable(q, velocity, goal)
         if onward is not None:
             family = self._with_short_way_on(family, onward)
@@ -226,7 +229,7 @@ class Planner:
         """
         soon = goal_in(self._period_s)
         self._remember_goal(soon)
-        for start in (_away_from_stops(q), q):
+        for start in (away_from_stops(q), q):
             posture = self._nearest_posture(start, soon)
             if posture is None:
                 continue
@@ -338,7 +341,7 @@ class Planner:
 
         def price(goals: FloatArray) -> FloatArray:
             times, effort = _stopping_travel_time(q[:6], velocity[:6], goals)
-            return times + TIE_BREAK_S * effort
+            return times + TIE_BREAK_S * effort + (_crowding(goals) if self._more_follow else 0.0)
 
         bound = (np.abs(joints - q[:6, None]) / _FULL_SPEED).max(axis=0)
         [listed] = np.nonzero(bound <= self._soonest_s)
@@ -483,10 +486,11 @@ class Planner:
         return least
 
 
-def _away_from_stops(q: FloatArray) -> FloatArray:
-    """Joint angles (7,) with those near their stops pushed back a little."""
-    near = 1.0 - (robot.JOINT_RANGE_RAD - np.abs(q)) / _DRIFT_RANGE_RAD
-    return np.asarray(q - _DRIFT_RAD * np.sign(q) * np.clip(near, 0.0, 1.0))
+def _crowding(postures: FloatArray) -> FloatArray:
+    """What postures (6, m) without A7 cost for joints near their stops, (m,) s."""
+    share = np.abs(postures) / robot.JOINT_RANGE_RAD[:6, None]
+    crowded = np.clip((share - _CROWDED_SHARE) / (1.0 - _CROWDED_SHARE), 0.0, 1.0)
+    return np.asarray(_ROOM_S * (crowded**2).sum(axis=0))
 
 
 def _where_braking_ends(q: FloatArray, velocity: FloatArray) -> FloatArray:

@@ -145,7 +145,10 @@ class Sequence(Placing[SequenceSpec, SequenceScenario]):
         """Let the present target vanish and target ``number`` appear, if there is one."""
         self._number, self._steps_shown, self._steps_held = number, 0, 0
         if number < self.spec.n_targets:
-            self._goal = self.goal_over(*self.scenario.targets[number, :2])
+            self._goal = dataclasses.replace(
+                self.goal_over(*self.scenario.targets[number, :2]),
+                more_follow=number + 1 < self.spec.n_targets,
+            )
             self.put_marker(physics, self._goal)
 
     def goal(self, ahead_s: float = 0.0) -> Goal:
