@@ -227,8 +227,9 @@ class Planner:
         Returns:
             (7,) rad.
         """
+        # What was left out for the last answer may be right for this one.
+        self._goal_key = b""
         soon = goal_in(self._period_s)
-        self._remember_goal(soon)
         for start in (away_from_stops(q), q):
             posture = self._nearest_posture(start, soon)
             if posture is None:

@@ -16,11 +16,12 @@ from hvs_suite.policies.servo.target_estimate import Sighting
 
 FloatArray = npt.NDArray[np.float64]
 Predict = Callable[[FloatArray], FloatArray]
-"""From the places up to now, (n, 2) m, to the one that the action brings the arm to, (2,) m."""
+"""From places seen, (n, 2) m, to those that the last `COUNTED` of them foretell, (m, 2) m."""
 
 SCENES = 200
 PERIOD_S, AHEAD_S = 0.1, 0.2
-STEPS, COUNTED, TOLERANCE_M = 80, 20, 0.001
+SEEN, COUNTED, TOLERANCE_M = 69, 20, 0.001
+"""Steps with a sighting: the first second goes by on the way to the target."""
 SPEED_M_S, ACCELERATION_M_S2 = 0.15, 0.3
 SIGHT_M = (0.00002, 0.00005, 0.0001)
 """Errors of a sighting, each axis; the eye in the hand's, measured, are 0.016 mm."""
@@ -31,10 +32,12 @@ def kalman(pace: float, jerk: float, noise_m: float) -> Predict:
 
     def predict(seen: FloatArray) -> FloatArray:
         estimate = MotionEstimate(0.0, SPEED_M_S, ACCELERATION_M_S2, pace, jerk)
+        foretold = []
         for place in seen:
             estimate.pass_time(PERIOD_S)
             estimate.see_eih(Sighting(place, noise_m**2 * np.eye(2), 1.0, True, 0.05, 40.0))
-        return estimate.place(AHEAD_S)[0]
+            foretold.append(estimate.place(AHEAD_S)[0])
+        return np.array(foretold[-COUNTED:])
 
     return predict
 
@@ -48,10 +51,14 @@ def gaussian_process(variance_m2: float, noise_m: float) -> Predict:
         return variance_m2 * np.cos(np.multiply.outer(apart_s, omega)) @ share + 1.0
 
     def predict(seen: FloatArray) -> FloatArray:
-        times = PERIOD_S * np.arange(1 - len(seen), 1)
-        K = covariance(times[:, None] - times) + noise_m**2 * np.eye(len(seen))
-        return np.asarray(np.linalg.solve(K, covariance(AHEAD_S - times)) @ seen)
+        # As many places as the first prediction has.
+        n = len(seen) - COUNTED + 1
+        return np.array([weights @ seen[end : end + n] for end in range(COUNTED)])
 
+    n = SEEN - COUNTED + 1
+    times = PERIOD_S * np.arange(1 - n, 1)
+    K = covariance(times[:, None] - times) + noise_m**2 * np.eye(n)
+    weights = np.linalg.solve(K, covariance(AHEAD_S - times))
     return predict
 
 
@@ -70,15 +77,11 @@ def main() -> None:
         }
         worst: dict[str, list[float]] = {name: [] for name in predictors}
         for motion in motions:
-            places = motion.place(PERIOD_S * np.arange(STEPS))
-            seen = places + noise * random.normal(size=places.shape)
+            times = 1.0 + PERIOD_S * np.arange(SEEN)
+            seen = motion.place(times) + noise * random.normal(size=(SEEN, 2))
+            true = motion.place(times[-COUNTED:] + AHEAD_S)
             for name, predict in predictors.items():
-                errors = []
-                for end in range(STEPS - COUNTED - 1, STEPS - 1):
-                    # The first second goes by on the way to the target.
-                    foreseen = predict(seen[10 : end + 1])
-                    errors.append(np.hypot(*(foreseen - motion.place(PERIOD_S * end + AHEAD_S))))
-                worst[name].append(max(errors))
+                worst[name].append(float(np.hypot(*(predict(seen) - true).T).max()))
         for name, errors_m in worst.items():
             solved = np.mean(np.array(errors_m) <= TOLERANCE_M)
             median, p90 = 1000.0 * np.percentile(errors_m, [50, 90])
