@@ -296,7 +296,7 @@ class Planner:
             return
         self._goal_key = key
         self._soonest_s = math.inf
-        family = np.empty((0, 7))
+        family: FloatArray = np.empty((0, 7))
         if among is not None:
             shapes = self._kinematics.goal_shapes(goal.position, goal.normal, self._n_swivel)
             family = shapes[among] if len(shapes) else shapes
