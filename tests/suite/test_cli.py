@@ -24,6 +24,7 @@ TASKS = (
     "sequence-hard",
     "track-line",
     "track-curve",
+    "track-hard",
 )
 
 

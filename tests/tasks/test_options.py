@@ -257,7 +257,7 @@ def test_named_tasks_mean_what_the_table_of_tasks_says() -> None:
     tasks = hvs_suite.TASKS
     assert list(tasks) == [
         "align-fixed", "align-easy", "align-thesis", "align-hard", "align-drill", "align-limit",
-        "sequence-thesis", "sequence-hard", "track-line", "track-curve",
+        "sequence-thesis", "sequence-hard", "track-line", "track-curve", "track-hard",
     ]  # fmt: skip
     own = {"align": "goal", "sequence": "target_steps", "track": "motion"}
     rows = {
@@ -276,9 +276,10 @@ def test_named_tasks_mean_what_the_table_of_tasks_says() -> None:
         "align-drill": ("random", "random", 0.01, None, 0.25, 1.0, 0.4, 5, 40),
         "align-limit": ("random", "random", 0.02, None, 0.1, 0.3, 0.2, 5, 40),
         "sequence-thesis": ("zero", 30, 0.05, 1.0, None, None, 1.0, 1, 150),
-        "sequence-hard": ("random", 40, 0.02, 0.5, None, None, 0.5, 3, 200),
+        "sequence-hard": ("random", 31, 0.02, None, 0.25, 1.0, 0.4, 5, 155),
         "track-line": ("zero", "line", 0.05, 1.0, None, None, 1.0, 20, 60),
         "track-curve": ("zero", "curve", 0.05, 1.0, None, None, 1.0, 20, 60),
+        "track-hard": ("random", "curve", 0.02, 1.0, None, None, 0.5, 20, 80),
     }
     for v in tasks.values():
         assert v.standoff_m == 0.05
