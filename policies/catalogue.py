@@ -7,7 +7,8 @@ from types import MappingProxyType
 from typing import Any
 
 from hvs_suite.errors import PolicyError
-from hvs_suite.policies import hub, imported
+from hvs_suite.policies import imported
+from hvs_suite.policies.checkpoints import hub
 from hvs_suite.policies.recipe import trained_on
 from hvs_suite.registry import find
 from hvs_suite.rollout import PolicyFactory
@@ -108,12 +109,12 @@ def _builtin(name: str) -> PolicyFactory:
 def _checkpoint(folder: Path, task: Spec) -> PolicyFactory:
     """Check a checkpoint here and now, before workers are started for it."""
     try:
-        from hvs_suite.policies import checkpoint, checkpoint_files
+        from hvs_suite.policies.checkpoints import files, loading
         from hvs_suite.policies.sac import playing
     except ImportError as error:
         raise PolicyError(f"playing {folder} needs torch; install hvs-suite[learn]") from error
     if playing.is_sac(folder):
         playing.check_fit(playing.read_config(folder), folder, task)
         return playing.SacFactory(str(folder.resolve()))
-    checkpoint.check_fit(checkpoint_files.read_config(folder), folder, task)
-    return checkpoint.CheckpointFactory(str(folder.resolve()))
+    loading.check_fit(files.read_config(folder), folder, task)
+    return loading.CheckpointFactory(str(folder.resolve()))

@@ -185,7 +185,8 @@ class Track(Placing[TrackSpec, TrackScenario]):
         """Draw motions until one stays on the ring for the whole episode."""
         spec, random = self.spec, streams.generator("motion")
         fastest = random.uniform(*spec.speed_m_s)
-        times: FloatArray = _CHECK_PERIOD_S * np.arange(round(spec.motion_s / _CHECK_PERIOD_S) + 1)
+        n_times = round(spec.motion_s / _CHECK_PERIOD_S) + 1
+        times = _CHECK_PERIOD_S * np.arange(n_times, dtype=np.float64)
         for _ in range(_MAX_REDRAWS):
             if spec.motion == "line":
                 motion = self._line(random, fastest)

@@ -10,9 +10,9 @@ from hvs_suite.cli import console
 from hvs_suite.errors import OptionError
 
 if TYPE_CHECKING:
-    from hvs_suite.eval.contender import Contender
-    from hvs_suite.eval.result_file import Result
-    from hvs_suite.eval.trial import Trial
+    from hvs_suite.eval.scoring.contender import Contender
+    from hvs_suite.eval.scoring.result_file import Result
+    from hvs_suite.eval.scoring.trial import Trial
     from hvs_suite.tasks.shared.metric import Metric
 
 # The first few say what is wrong; a thousand of the same hide it.
@@ -55,7 +55,7 @@ class Evaluate:
     def run(self) -> int:
         """Evaluate, write the results, print their summaries."""
         from hvs_suite import files, registry
-        from hvs_suite.eval import trial
+        from hvs_suite.eval.scoring import trial
 
         if not self.task:
             raise OptionError("name a --task; 'hvs tasks' lists them")
@@ -78,18 +78,18 @@ class Evaluate:
         return 0
 
     def _find(self, task: str, options: Mapping[str, Any]) -> "Contender":
-        from hvs_suite.eval import contender
+        from hvs_suite.eval.scoring import contender
 
         if self.server is None:
             return contender.find(self.policy, task, options)
-        from hvs_suite.eval import remote_policy
+        from hvs_suite.eval.serving import remote_policy
 
         return remote_policy.find(self.server, self.policy, task, self.decision_limit, options)
 
     def _evaluate(
         self, task: str, path: Path, contender: "Contender", options: Mapping[str, Any]
     ) -> "Result":
-        from hvs_suite.eval import protocol
+        from hvs_suite.eval.scoring import protocol
 
         n_played = n_success = n_failure = 0
         with console.progress(f"{contender.name} on {task}", self.episodes) as advance:

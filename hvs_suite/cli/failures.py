@@ -32,7 +32,8 @@ class Failures:
 
     def run(self) -> None:
         """Play, sort, draw and print."""
-        from hvs_suite.eval import failures, result_file
+        from hvs_suite.eval.scoring import result_file
+        from hvs_suite.eval.studies import failures
         from hvs_suite.files import check_writable, replacing
 
         if not self.results:
@@ -72,9 +73,10 @@ class Failures:
     def _draw(self, out: Path, path: Path, report: Any, checkpoint: Path) -> None:
         """What the cameras showed and where the policy looked, for the first of each cause."""
         import hvs_suite
-        from hvs_suite.eval import action_log, failures, result_file
+        from hvs_suite.eval.scoring import action_log, result_file
+        from hvs_suite.eval.studies import failures
+        from hvs_suite.eval.studies.attention import draw_attention
         from hvs_suite.files import replacing
-        from hvs_suite.policies.attention import draw_attention
 
         result = result_file.load(path)
         log = action_log.load(result_file.actions_path(path), result.metadata.actions_sha256)

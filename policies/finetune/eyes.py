@@ -18,14 +18,6 @@ import torch
 from torch import Tensor
 
 from hvs_suite.datasets.features import dataset_features
-from hvs_suite.policies.dagger import play_round, read_round
-from hvs_suite.policies.demonstrations import (
-    GOAL_NORMAL,
-    GOAL_POSITION,
-    TARGET_PREFIX,
-    FramePool,
-    Manifest,
-)
 from hvs_suite.policies.finetune.folding import load_base, write_folded
 from hvs_suite.policies.finetune.settings import Settings
 from hvs_suite.policies.hvs.network import (
@@ -36,6 +28,14 @@ from hvs_suite.policies.hvs.network import (
     HvsNetwork,
     sighting_loss,
     target_loss,
+)
+from hvs_suite.policies.imitation.dagger import play_round, read_round
+from hvs_suite.policies.imitation.demonstrations import (
+    GOAL_NORMAL,
+    GOAL_POSITION,
+    TARGET_PREFIX,
+    FramePool,
+    Manifest,
 )
 from hvs_suite.policies.rl.evaluation import Evaluation, read_evaluations, write_evaluations
 from hvs_suite.policies.rl.journal import SCENES_A_SEED

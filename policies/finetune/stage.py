@@ -17,7 +17,7 @@ from gymnasium import spaces
 
 from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S, after_commands
-from hvs_suite.policies.checkpoint import network_inputs
+from hvs_suite.policies.checkpoints.loading import network_inputs
 from hvs_suite.policies.finetune.folding import load_base
 from hvs_suite.policies.hvs.compiled import CompiledFeatures
 from hvs_suite.policies.hvs.network import N_JOINTS

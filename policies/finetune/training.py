@@ -20,14 +20,13 @@ import torch
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
 
-from hvs_suite.policies.allocator import keep_freed_memory
 from hvs_suite.policies.catalogue import name_of
-from hvs_suite.policies.checkpoint import (
+from hvs_suite.policies.checkpoints.files import read_config
+from hvs_suite.policies.checkpoints.loading import (
     CheckpointPolicy,
     check_fit,
     weights_digest,
 )
-from hvs_suite.policies.checkpoint_files import read_config
 from hvs_suite.policies.finetune.eyes import train_eyes
 from hvs_suite.policies.finetune.folding import load_base, with_residual, write_folded
 from hvs_suite.policies.finetune.meanwhile import Meanwhile, MeanwhileHere, MeanwhileThere
@@ -40,7 +39,8 @@ from hvs_suite.policies.rl.curriculum import Curriculum, Kind, levels_of
 from hvs_suite.policies.rl.evaluation import Evaluation, Examiner
 from hvs_suite.policies.rl.journal import OUTCOMES, Journal
 from hvs_suite.policies.rl.run import Budget, Outcome, Progress, Run, check_run
-from hvs_suite.policies.run_folder import claimed, write_train_config
+from hvs_suite.policies.training.allocator import keep_freed_memory
+from hvs_suite.policies.training.run_folder import claimed, write_train_config
 from hvs_suite.registry import find, options_of
 from hvs_suite.rollout import library_seeds, worker_conditions
 from hvs_suite.tasks.shared.spec import Spec

@@ -76,7 +76,7 @@ class HvsPolicy(PreTrainedPolicy):
 
     def _calibrate_from(self, root: Path) -> None:
         from hvs_suite.errors import DatasetError
-        from hvs_suite.policies.demonstrations import calibration_of
+        from hvs_suite.policies.imitation.demonstrations import calibration_of
 
         try:
             self.network.set_calibration(calibration_of(root))

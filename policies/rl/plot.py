@@ -5,7 +5,7 @@ from pathlib import Path
 
 from hvs_suite.files import replacing
 from hvs_suite.policies.rl.evaluation import Evaluation
-from hvs_suite.policies.training_plot import PICTURE, read_curves
+from hvs_suite.policies.training.plot import PICTURE, read_curves
 from hvs_suite.statistics import wilson_interval
 
 ROLLOUT = {"rollout/success_rate": "solved", "rollout/collision": "collided"}

@@ -18,7 +18,6 @@ from stable_baselines3.common.logger import Logger
 
 from hvs_suite.errors import OptionError
 from hvs_suite.files import replacing
-from hvs_suite.policies.curves import Curves
 from hvs_suite.policies.rl.curves import LoggedCurves
 from hvs_suite.policies.rl.evaluation import (
     Evaluation,
@@ -31,6 +30,7 @@ from hvs_suite.policies.rl.evaluation import (
 from hvs_suite.policies.rl.journal import OUTCOMES
 from hvs_suite.policies.rl.plot import draw_rl_run
 from hvs_suite.policies.rl.state import Counters, Model, load_run, save_run
+from hvs_suite.policies.training.curves import Curves
 from hvs_suite.rollout import Policy
 from hvs_suite.tasks.shared.scenario import TEST_SPLIT
 

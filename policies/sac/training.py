@@ -16,14 +16,14 @@ from gymnasium import spaces
 from stable_baselines3 import SAC
 
 from hvs_suite.errors import OptionError
-from hvs_suite.policies.allocator import keep_freed_memory
 from hvs_suite.policies.rl.evaluation import Examiner
 from hvs_suite.policies.rl.journal import Journal, make_journal
 from hvs_suite.policies.rl.run import Budget, Outcome, Progress, Run, check_run
-from hvs_suite.policies.run_folder import claimed, write_train_config
 from hvs_suite.policies.sac.network import policy_kwargs
 from hvs_suite.policies.sac.playing import GreedyActor, save_actor, write_config
 from hvs_suite.policies.sac.settings import Settings
+from hvs_suite.policies.training.allocator import keep_freed_memory
+from hvs_suite.policies.training.run_folder import claimed, write_train_config
 from hvs_suite.registry import find, options_of
 from hvs_suite.rollout import library_seeds
 from hvs_suite.tasks.shared.spec import (

@@ -8,8 +8,9 @@ import pytest
 
 from hvs_suite.cli.main import run
 from hvs_suite.datasets.check import check_dataset
-from hvs_suite.eval import policy_session, protocol, result_file, verification
-from hvs_suite.eval.remote_policy import hello
+from hvs_suite.eval.scoring import protocol, result_file, verification
+from hvs_suite.eval.serving import policy_session
+from hvs_suite.eval.serving.remote_policy import hello
 from hvs_suite.registry import load
 
 TASK = "align-easy"

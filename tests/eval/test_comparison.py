@@ -9,8 +9,8 @@ from test_result_file import make_result, row
 
 from hvs_suite.cli import main
 from hvs_suite.errors import ResultError, UnknownTaskError
-from hvs_suite.eval import comparison, lerobot_import, result_file
-from hvs_suite.eval.result_file import Result, Summary
+from hvs_suite.eval.scoring import comparison, lerobot_import, result_file
+from hvs_suite.eval.scoring.result_file import Result, Summary
 from hvs_suite.registry import find
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from hvs_suite.cli import main
-from hvs_suite.eval import result_file
+from hvs_suite.eval.scoring import result_file
 
 RESULTS = Path(__file__).parents[2] / "eval" / "results"
 

@@ -8,17 +8,12 @@ from forgeries import with_errors
 from test_result_file import make_result
 
 from hvs_suite.errors import ResultError
-from hvs_suite.eval import (
-    board_tables,
-    comparison,
-    failures,
-    leaderboard,
-    protocol,
-    result_file,
-    verification,
-)
-from hvs_suite.eval.board_page import page
-from hvs_suite.eval.board_tables import Entry
+from hvs_suite.eval import leaderboard
+from hvs_suite.eval.board import tables
+from hvs_suite.eval.board.page import page
+from hvs_suite.eval.board.tables import Entry
+from hvs_suite.eval.scoring import comparison, protocol, result_file, verification
+from hvs_suite.eval.studies import failures
 from hvs_suite.registry import find
 
 HEADLINES = {
@@ -133,7 +128,7 @@ BOARD = [
 
 def test_a_family_alone_is_not_sunk_by_the_others_and_a_task_left_out_of_it_is() -> None:
     entries = [entry(*row) for row in BOARD]
-    table = board_tables.overall(entries)
+    table = tables.overall(entries)
     assert [(row.policy, row.coverage) for row in table] == [
         ("all-round", "3 of 3"),
         ("aligns", "1 of 3"),
@@ -142,12 +137,12 @@ def test_a_family_alone_is_not_sunk_by_the_others_and_a_task_left_out_of_it_is()
     # (100 + 60) / 2, 40 and 0 over three families; one family; half of one family's tasks.
     assert [row.mean for row in table] == pytest.approx([40.0, 80.0, 50.0])
     assert all(row.low <= row.mean <= row.high for row in table)
-    for text in (board_tables.markdown(entries), page(entries)):
+    for text in (tables.markdown(entries), page(entries)):
         assert re.findall(r"[13] of 3", text)[:3] == ["3 of 3", "1 of 3", "1 of 3"]
 
 
 def test_each_task_counts_alike_in_its_family_whatever_the_order_of_entries() -> None:
     entries = [entry(*row) for row in BOARD]
-    assert [(row.policy, row.mean) for row in board_tables.overall(entries[::-1])] == [
-        (row.policy, row.mean) for row in board_tables.overall(entries)
+    assert [(row.policy, row.mean) for row in tables.overall(entries[::-1])] == [
+        (row.policy, row.mean) for row in tables.overall(entries)
     ]

@@ -7,7 +7,7 @@ import pytest
 
 from hvs_suite.cli import main
 from hvs_suite.errors import OptionError, PolicyError, ScenarioError, UnknownTaskError
-from hvs_suite.eval import protocol, result_file
+from hvs_suite.eval.scoring import protocol, result_file
 from hvs_suite.registry import TASKS
 
 

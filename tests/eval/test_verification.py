@@ -15,9 +15,11 @@ from dm_env import specs
 
 from hvs_suite.cli import main
 from hvs_suite.errors import ResultError
-from hvs_suite.eval import board_clips, failures, protocol, result_file, verification
-from hvs_suite.eval.result_file import EpisodeRow, Summary
-from hvs_suite.eval.trial import EpisodeLostError, play_trial
+from hvs_suite.eval.board import clips
+from hvs_suite.eval.scoring import protocol, result_file, verification
+from hvs_suite.eval.scoring.result_file import EpisodeRow, Summary
+from hvs_suite.eval.scoring.trial import EpisodeLostError, play_trial
+from hvs_suite.eval.studies import failures
 from hvs_suite.policies import builtin
 
 TASK = "align-thesis"
@@ -274,7 +276,7 @@ def test_a_built_in_policy_plays_again_what_is_not_logged(partly_logged: Path) -
     # So do those who look for the reasons of failures, and those who draw clips.
     lost = sum(not row.success for row in result.episodes)
     assert len(failures.sort_failures(partly_logged).failures) == lost
-    assert all(row.scenario < 2 for _, row in board_clips.choose(result))
+    assert all(row.scenario < 2 for _, row in clips.choose(result))
 
 
 @pytest.mark.parametrize("scenario", [1, 3])

@@ -19,7 +19,7 @@ from hvs_suite.cli.main import run
 from hvs_suite.datasets.expert import Expert
 from hvs_suite.errors import OptionError, PolicyError
 from hvs_suite.gym import TaskEnv
-from hvs_suite.policies.checkpoint import CheckpointPolicy
+from hvs_suite.policies.checkpoints.loading import CheckpointPolicy
 from hvs_suite.policies.finetune.folding import load_base, with_residual, write_folded
 from hvs_suite.policies.finetune.outlook import Outlook
 from hvs_suite.policies.finetune.residual_td3 import WARM_UP_UPDATES, ResidualPolicy
@@ -32,7 +32,7 @@ from hvs_suite.policies.finetune.stage import (
 )
 from hvs_suite.policies.finetune.training import finetune
 from hvs_suite.policies.hvs.network import CONTROL_PERIOD_S, SET_POINT
-from hvs_suite.policies.pretrain import pretrain
+from hvs_suite.policies.imitation.pretrain import pretrain
 from hvs_suite.policies.rl.evaluation import Evaluation, fallen
 from hvs_suite.policies.rl.journal import Journal
 from hvs_suite.rollout import run_episode

@@ -14,9 +14,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from hvs_suite.cli import main
 from hvs_suite.errors import OutputError, PolicyError
-from hvs_suite.policies.curves import Curves
-from hvs_suite.policies.frame_cache import new_frames
-from hvs_suite.policies.pretrain import pretrain
+from hvs_suite.policies.imitation.frame_cache import new_frames
+from hvs_suite.policies.imitation.pretrain import pretrain
+from hvs_suite.policies.training.curves import Curves
 
 RUN = {"steps": 6, "batch_size": 8, "seed": 3, "checkpoint_period_s": 0.0}
 WORDS = "pretrain --data {data} --out {out} --steps 6 --seed 3"

@@ -10,11 +10,11 @@ import pytest
 from hub_server import running_hub
 
 from hvs_suite.cli.main import run
-from hvs_suite.policies import card, checkpoint_files
 from hvs_suite.policies.catalogue import policy_factory
+from hvs_suite.policies.checkpoints import card, files
 
 TOKEN = "hf_" + "NeverToBeSeen" * 2
-FILES = {card.CARD, *checkpoint_files.FILES, *card.TRAINING_FILES}
+FILES = {card.CARD, *files.FILES, *card.TRAINING_FILES}
 
 
 def files_below(folder: Path) -> set[str]:

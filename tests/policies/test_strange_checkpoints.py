@@ -24,13 +24,14 @@ from safetensors.numpy import load_file, save_file
 
 from hvs_suite.cli import main
 from hvs_suite.errors import HvsError, PolicyError
-from hvs_suite.eval import action_log, contender
-from hvs_suite.eval.provenance import file_hash
-from hvs_suite.policies import dagger, imported
+from hvs_suite.eval.scoring import action_log, contender
+from hvs_suite.eval.scoring.provenance import file_hash
+from hvs_suite.policies import imported
 from hvs_suite.policies.catalogue import checkpoint_folder, policy_factory
-from hvs_suite.policies.checkpoint_files import read_config, read_shapes
-from hvs_suite.policies.frame_cache import open_frames
-from hvs_suite.policies.training_state import load_state
+from hvs_suite.policies.checkpoints.files import read_config, read_shapes
+from hvs_suite.policies.imitation import dagger
+from hvs_suite.policies.imitation.frame_cache import open_frames
+from hvs_suite.policies.imitation.state import load_state
 from hvs_suite.registry import TASKS
 
 TASK = "align-easy"
@@ -144,7 +145,7 @@ def test_nobody_passes_such_a_checkpoint_on(
 
 
 def test_eyes_are_not_taken_from_such_a_checkpoint(strange: Path, tmp_path: Path) -> None:
-    from hvs_suite.policies.checkpoint import weights_digest
+    from hvs_suite.policies.checkpoints.loading import weights_digest
 
     with_step(strange, "preprocessor", payloads(tmp_path / "marker")["Popen"])
     # The first thing that pretraining asks of the folder.

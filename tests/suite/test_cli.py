@@ -410,7 +410,7 @@ def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(tmp_path):
 
 def test_a_folder_has_one_writer_until_that_ends_however_it_ends(tmp_path):
     from hvs_suite.errors import OutputError
-    from hvs_suite.policies.run_folder import claimed
+    from hvs_suite.policies.training.run_folder import claimed
 
     holds = (
         "import pathlib, sys; from hvs_suite.files import only_writer\n"

@@ -32,7 +32,8 @@ _NAMES = """
 import sys
 from pathlib import Path
 from hvs_suite.errors import ResultError
-from hvs_suite.eval import ours, result_file
+from hvs_suite.eval.board import ours
+from hvs_suite.eval.scoring import result_file
 expert, mine = (Path(sys.argv[1], name, "shelf-easy.json") for name in ("expert", "mine"))
 ours.check(expert, result_file.load(expert))
 ours.check(mine, result_file.load(mine))

@@ -1,0 +1,225 @@
+"""How a policy is scored: scenarios 0..N-1 of a split, the task as named, every episode a row.
+
+Studies may change the task by options; the result says so, and is no score then.
+"""
+
+import contextlib
+import dataclasses
+import datetime
+import hashlib
+import random
+import time
+from collections.abc import Callable, Generator, Mapping
+from pathlib import Path
+from typing import Any
+
+from hvs_suite import files, registry, rollout
+from hvs_suite.errors import OptionError, ScenarioError
+from hvs_suite.eval.scoring import action_log, contender, progress_file, provenance, result_file
+from hvs_suite.eval.scoring.contender import Contender
+from hvs_suite.eval.scoring.trial import DECISION_LIMIT_S, PlayTrial, Trial, check_decision_limit
+from hvs_suite.eval.serving import policy_process
+from hvs_suite.policies import catalogue
+from hvs_suite.tasks.shared import lock
+from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
+
+LOGGED_OF_BUILTIN = 100
+"""Scenarios that the log of a built-in policy holds: it can play the others again."""
+
+Progress = Callable[[Trial], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class MakeTask:
+    """Builds a task in whichever process asks for it.
+
+    Attributes:
+        task: Named task.
+        split: Split its scenarios come from.
+        options: Options that differ from it.
+        pictures: Draw the observations; a re-simulation needs none.
+    """
+
+    task: str
+    split: str
+    options: Mapping[str, Any]
+    pictures: bool = True
+
+    def __call__(self) -> rollout.Environment:
+        """Returns a new environment."""
+        unseen = {} if self.pictures else {"observations": "state"}
+        options = {**self.options, **unseen}
+        env: rollout.Environment = registry.load(self.task, split=self.split, **options)
+        return env
+
+
+def evaluate(
+    policy: str | Contender,
+    task: str,
+    out: Path | None = None,
+    *,
+    split: str = TEST_SPLIT,
+    episodes: int = TEST_SCENARIOS,
+    options: Mapping[str, Any] = catalogue.AS_NAMED,
+    workers: int = 1,
+    decision_limit_s: float = DECISION_LIMIT_S,
+    progress: Progress | None = None,
+) -> result_file.Result:
+    """Scores a policy on the first scenarios of a split and writes the result.
+
+    Interrupted, the same call goes on where it was, and ends in the same result. A person's own
+    code (``module:factory``) plays in a process of its own, which holds no simulator. Scenarios
+    come in an order drawn for this run: no policy learns by counting which one it plays.
+
+    Args:
+        policy: What `hvs_suite.policies.catalogue.policy_factory` takes, or a contender that was
+            found for the task and the options.
+        task: Named task.
+        out: Result file to write (JSON); the action log and, meanwhile, what is already played
+            stand beside it. None writes nothing.
+        split: Split to play; ``test`` for a score, any other name for a look.
+        episodes: Scenarios to play: 0 to `episodes` - 1.
+        options: Options of the task that differ from the named one, for studies; only the task as
+            named is a score.
+        workers: Processes; the episodes are the same for any number.
+        decision_limit_s: Time after which a decision loses its episode (s).
+        progress: Called after each episode, in the order in which they end; at once for those that
+            an interrupted call left.
+
+    Returns:
+        The result.
+
+    Raises:
+        UnknownTaskError: There is no such task.
+        PolicyError: There is no such policy, or it does not fit the task.
+        ScenarioError: The split does not hold that many scenarios.
+        OptionError: `episodes` or `workers` is below 1, the time limit is no time limit, or an
+            option of the task makes no sense.
+        OutputError: The result cannot be written, another process is writing it, or the beginning
+            of another one is in its place.
+        RenderError: Nothing here can draw the images.
+        ServerError: The policy's server is gone; what is already played is kept.
+    """
+    if episodes < 1:
+        raise OptionError(f"episodes must be at least 1, not {episodes}")
+    if workers < 1:
+        raise OptionError(f"workers must be at least 1, not {workers}")
+    check_decision_limit(decision_limit_s)
+    if split == TEST_SPLIT and episodes > TEST_SCENARIOS:
+        raise ScenarioError(
+            f"split {TEST_SPLIT!r} holds {TEST_SCENARIOS} scenarios, not {episodes}; ask for "
+            f"{TEST_SCENARIOS} episodes or fewer"
+        )
+    spec = registry.find(task).with_options(options)
+    options = registry.options_of(spec)
+    if spec.action_mode == "flange_twist":
+        raise OptionError("action_mode=flange_twist has six numbers; an action log holds seven")
+    player = contender.find(policy, task, options) if isinstance(policy, str) else policy
+    make = player.make
+    if player.kind == "module":
+        make = policy_process.ProcessFactory(player.name, str(Path.cwd()), task, decision_limit_s)
+    renderer = provenance.gl_renderer()
+    identity = {
+        "schema_version": result_file.SCHEMA_VERSION,
+        "task": task,
+        "task_digest": lock.digest(task),
+        "options": options,
+        "split": split,
+        "policy": player.name,
+        "policy_kind": player.kind,
+        "policy_hash": player.hash,
+        "decision_limit_s": decision_limit_s,
+        "suite_version": provenance.suite_version(),
+        "packages": provenance.package_versions(),
+        "gl_renderer": renderer,
+        "cpu": provenance.cpu(),
+    }
+    created = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    partial = None if out is None else out.with_name(out.name + progress_file.SUFFIX)
+    if out is not None:
+        files.check_writable(out)
+    with progress_file.ProgressFile(partial, identity) as kept:
+        order = random.Random(kept.salt).sample(range(episodes), episodes)
+        wall_s = _play_rest(
+            kept,
+            rollout.play(
+                MakeTask(task, split, options),
+                make,
+                [index for index in order if index not in kept.trials],
+                PlayTrial(decision_limit_s, kept.salt),
+                workers=workers,
+            ),
+            progress,
+        )
+        trials = [kept.trials[index] for index in range(episodes)]
+        rows = [trial.row for trial in trials]
+        actions = [trial.actions for trial in trials]
+        plays_again = player.kind == "builtin" and not options
+        n_logged = min(LOGGED_OF_BUILTIN, episodes) if plays_again else episodes
+        log = action_log.encode(actions[:n_logged])
+        steps = sum(map(len, actions))
+        result = result_file.Result(
+            schema_version=result_file.SCHEMA_VERSION,
+            summary=result_file.Summary.of(
+                task,
+                player.name,
+                split,
+                rows,
+                tolerances=spec.tolerances,
+                time_limit_steps=spec.time_limit_steps,
+            ),
+            metadata=result_file.Metadata(
+                created=created,
+                suite_version=provenance.suite_version(),
+                task_version=spec.version,
+                task_digest=lock.digest(task),
+                tolerances=spec.tolerances,
+                time_limit_steps=spec.time_limit_steps,
+                options=options,
+                policy_kind=player.kind,
+                policy_hash=player.hash,
+                policy_parameters=player.parameters,
+                training_steps=player.training_steps,
+                training_hours=player.training_hours,
+                decision_limit_s=decision_limit_s,
+                actions_sha256=hashlib.sha256(log).hexdigest(),
+                n_logged=n_logged,
+                packages=provenance.package_versions(),
+                gl_renderer=renderer,
+                cpu=provenance.cpu(),
+                platform=provenance.operating_system(),
+            ),
+            timings=result_file.Timings(
+                workers=workers,
+                wall_s=wall_s,
+                steps_per_s=steps * min(workers, episodes) / sum(t.play_s for t in trials),
+                decision_ms=1000 * sum(trial.decision_s for trial in trials) / max(steps, 1),
+                decision_ms_max=1000 * max(trial.slowest_s for trial in trials),
+            ),
+            episodes=rows,
+        )
+        if out is not None:
+            # The log first: a result never stands there without the log that it speaks of.
+            with files.replacing(result_file.actions_path(out)) as temporary:
+                temporary.write_bytes(log)
+            result_file.write(result, out)
+        kept.remove()
+    return result
+
+
+def _play_rest(
+    kept: progress_file.ProgressFile,
+    played: Generator[Trial, None, None],
+    progress: Progress | None,
+) -> float:
+    """Keeps trials as they come; returns the wall time over all sittings (s)."""
+    before, started = kept.elapsed_s, time.perf_counter()
+    for trial in kept.trials.values():
+        if progress is not None:
+            progress(trial)
+    with contextlib.closing(played):
+        for trial in played:
+            kept.add(trial, before + time.perf_counter() - started)
+            if progress is not None:
+                progress(trial)
+    return before + time.perf_counter() - started
