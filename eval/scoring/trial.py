@@ -21,6 +21,7 @@ import dm_env
 import numpy as np
 import numpy.typing as npt
 
+from hvs_suite import registry, rollout
 from hvs_suite.errors import OptionError, describe
 from hvs_suite.eval.scoring.result_file import EpisodeRow, Settled
 from hvs_suite.rollout import Action, Observation, Policy, library_seeds
@@ -132,6 +133,27 @@ def outcome(row: EpisodeRow) -> dict[str, Any]:
         "settled.collision": end.collision,
         "settled.failure": end.failure,
     }
+
+
+@dataclasses.dataclass(frozen=True)
+class MakeTask:
+    """Builds a named task in whichever process asks for it.
+
+    Attributes:
+        task: Named task.
+        split: Split its scenarios come from.
+        pictures: Draw the observations; a re-simulation needs none.
+    """
+
+    task: str
+    split: str
+    pictures: bool = True
+
+    def __call__(self) -> rollout.Environment:
+        """Returns a new environment."""
+        options: dict[str, Any] = {} if self.pictures else {"observations": "state"}
+        env: rollout.Environment = registry.load(self.task, split=self.split, **options)
+        return env
 
 
 @dataclasses.dataclass(frozen=True)

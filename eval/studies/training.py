@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from hvs_suite.errors import ResultError
-from hvs_suite.eval.scoring import protocol, result_file
+from hvs_suite.eval import protocol
+from hvs_suite.eval.scoring import result_file
 from hvs_suite.eval.scoring.result_file import Result
 
 Report = Callable[[str, float, str], None]

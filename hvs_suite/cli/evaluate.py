@@ -81,7 +81,7 @@ class Evaluate:
         return remote_policy.find(self.server, self.policy, task, self.decision_limit)
 
     def _evaluate(self, task: str, path: Path, contender: "Contender") -> "Result":
-        from hvs_suite.eval.scoring import protocol
+        from hvs_suite.eval import protocol
 
         n_played = n_success = n_failure = 0
         with console.progress(f"{contender.name} on {task}", self.episodes) as advance:

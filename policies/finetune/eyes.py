@@ -20,6 +20,7 @@ from torch import Tensor
 from hvs_suite.datasets.features import dataset_features
 from hvs_suite.policies.finetune.folding import load_base, write_folded
 from hvs_suite.policies.finetune.settings import Settings
+from hvs_suite.policies.hvs.dataset import GOAL_NORMAL, GOAL_POSITION, TARGET_PREFIX, Manifest
 from hvs_suite.policies.hvs.network import (
     IMAGE_PREFIX,
     MEMORY,
@@ -30,13 +31,7 @@ from hvs_suite.policies.hvs.network import (
     target_loss,
 )
 from hvs_suite.policies.imitation.dagger import play_round, read_round
-from hvs_suite.policies.imitation.demonstrations import (
-    GOAL_NORMAL,
-    GOAL_POSITION,
-    TARGET_PREFIX,
-    FramePool,
-    Manifest,
-)
+from hvs_suite.policies.imitation.demonstrations import FramePool
 from hvs_suite.policies.rl.evaluation import Evaluation, read_evaluations, write_evaluations
 from hvs_suite.policies.rl.journal import SCENES_A_SEED
 from hvs_suite.tasks.shared.spec import Spec

@@ -20,13 +20,9 @@ import torch
 from hvs_suite.errors import OptionError, PolicyError
 from hvs_suite.files import replacing
 from hvs_suite.policies.checkpoints.loading import weights_digest
+from hvs_suite.policies.hvs.dataset import Manifest, read_manifest, refuse_test_split
 from hvs_suite.policies.imitation.dagger import RoundSummary, play_round, read_round, round_shares
-from hvs_suite.policies.imitation.demonstrations import (
-    Demonstrations,
-    Manifest,
-    read_manifest,
-    refuse_test_split,
-)
+from hvs_suite.policies.imitation.demonstrations import Demonstrations
 from hvs_suite.policies.imitation.frame_cache import fingerprint
 from hvs_suite.policies.imitation.settings import (
     Settings,

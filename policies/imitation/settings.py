@@ -12,9 +12,9 @@ from hvs_suite.datasets.features import ACTION_EXECUTED
 from hvs_suite.errors import OptionError, PolicyError
 from hvs_suite.policies.checkpoints.files import read_config
 from hvs_suite.policies.checkpoints.loading import load_network
-from hvs_suite.policies.checkpoints.trained_for import trained_for
+from hvs_suite.policies.hvs.dataset import Manifest, calibration_of
 from hvs_suite.policies.hvs.network import IMAGE_PREFIX, STATE, Eye
-from hvs_suite.policies.imitation.demonstrations import Manifest, calibration_of
+from hvs_suite.policies.trained_for import trained_for
 from hvs_suite.registry import find
 
 if TYPE_CHECKING:

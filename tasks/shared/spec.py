@@ -306,6 +306,11 @@ class Spec(Timing, Cameras, Disturbances):
         units = {metric.name: metric.unit for metric in self.metrics}
         return min(bound for name, bound in self.step_bounds.items() if units[name] == "mm")
 
+    @property
+    def landing_metric(self) -> Metric | None:
+        """The distance from the goal in its plane that counts; None where nothing lands."""
+        return None
+
     def instruction(self, scenario: "Scenario | None" = None) -> str:
         """The task as one sentence, identical in environment and dataset.
 

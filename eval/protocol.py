@@ -1,20 +1,24 @@
 """How a policy is scored: scenarios 0..N-1 of a split, the task as named, every episode a row."""
 
 import contextlib
-import dataclasses
 import datetime
 import hashlib
 import random
 import time
 from collections.abc import Callable, Generator
 from pathlib import Path
-from typing import Any
 
 from hvs_suite import files, registry, rollout
 from hvs_suite.errors import OptionError, ScenarioError
 from hvs_suite.eval.scoring import action_log, contender, progress_file, provenance, result_file
 from hvs_suite.eval.scoring.contender import Contender
-from hvs_suite.eval.scoring.trial import DECISION_LIMIT_S, PlayTrial, Trial, check_decision_limit
+from hvs_suite.eval.scoring.trial import (
+    DECISION_LIMIT_S,
+    MakeTask,
+    PlayTrial,
+    Trial,
+    check_decision_limit,
+)
 from hvs_suite.eval.serving import policy_process
 from hvs_suite.tasks.shared import lock
 from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
@@ -23,27 +27,6 @@ LOGGED_OF_BUILTIN = 100
 """Scenarios that the log of a built-in policy holds: it can play the others again."""
 
 Progress = Callable[[Trial], None]
-
-
-@dataclasses.dataclass(frozen=True)
-class MakeTask:
-    """Builds a named task in whichever process asks for it.
-
-    Attributes:
-        task: Named task.
-        split: Split its scenarios come from.
-        pictures: Draw the observations; a re-simulation needs none.
-    """
-
-    task: str
-    split: str
-    pictures: bool = True
-
-    def __call__(self) -> rollout.Environment:
-        """Returns a new environment."""
-        options: dict[str, Any] = {} if self.pictures else {"observations": "state"}
-        env: rollout.Environment = registry.load(self.task, split=self.split, **options)
-        return env
 
 
 def evaluate(
