@@ -30,14 +30,18 @@ from hvs_suite.policies.checkpoints.loading import (
 )
 from hvs_suite.policies.finetune.eyes import train_eyes
 from hvs_suite.policies.finetune.folding import load_base, with_residual, write_folded
-from hvs_suite.policies.finetune.meanwhile import Meanwhile, MeanwhileHere, MeanwhileThere
 from hvs_suite.policies.finetune.outlook import Outlook
+from hvs_suite.policies.finetune.overlapped import (
+    Overlapped,
+    OverlappedDummyVecEnv,
+    OverlappedSubprocVecEnv,
+)
 from hvs_suite.policies.finetune.residual_td3 import ResidualPolicy, ResidualTD3
 from hvs_suite.policies.finetune.settings import Settings
 from hvs_suite.policies.finetune.stage import ResidualStage
 from hvs_suite.policies.hvs.network import N_JOINTS, HvsNetwork
 from hvs_suite.policies.rl.curriculum import Curriculum, Kind, levels_of
-from hvs_suite.policies.rl.evaluation import Evaluation, Examiner
+from hvs_suite.policies.rl.evaluation import Evaluation, Evaluator
 from hvs_suite.policies.rl.journal import OUTCOMES, Journal
 from hvs_suite.policies.rl.run import Budget, Outcome, Progress, Run, check_run
 from hvs_suite.policies.training.allocator import keep_freed_memory
@@ -128,10 +132,10 @@ def finetune(
 
         # Torch and SB3 draw from the global generators of NumPy and torch.
         stack.enter_context(library_seeds(seed))
-        examiner = stack.enter_context(contextlib.closing(Examiner(spec, options, eval_episodes)))
+        evaluator = stack.enter_context(contextlib.closing(Evaluator(spec, options, eval_episodes)))
 
         def examine(checkpoint: Path, frames: int, updates: int) -> Evaluation:
-            return examiner.evaluate(
+            return evaluator.evaluate(
                 CheckpointPolicy(checkpoint, spec),
                 frames,
                 updates,
@@ -148,7 +152,7 @@ def finetune(
         stack.callback(environments.close)
         model = _make_model(environments, load_base(base), settings, seed)
         learner = _Finetuned(model, base, out, spec)
-        run = Run(out, learner, examiner, on_progress)
+        run = Run(out, learner, evaluator, on_progress)
         stack.callback(run.close)
         run.train(limit, settings.collect_steps, eval_every, checkpoint_period_s)
         return run.outcome()
@@ -193,13 +197,13 @@ class MakeStage:
         return Journal(stage, self.seed, self.part, settings.environments, settings.lost_share)
 
 
-def _environments(make: MakeStage) -> Meanwhile:
+def _environments(make: MakeStage) -> Overlapped:
     """All environments of a run: a process each, or this one for a single one."""
     parts = [dataclasses.replace(make, part=i) for i in range(make.settings.environments)]
     if len(parts) == 1:
-        return MeanwhileHere([*parts])
+        return OverlappedDummyVecEnv([*parts])
     with worker_conditions():
-        return MeanwhileThere([*parts], start_method="spawn")
+        return OverlappedSubprocVecEnv([*parts], start_method="spawn")
 
 
 class _Finetuned:
@@ -232,7 +236,7 @@ class _Finetuned:
 
 
 def _make_model(
-    environments: Meanwhile, base: HvsNetwork, settings: Settings, seed: int
+    environments: Overlapped, base: HvsNetwork, settings: Settings, seed: int
 ) -> ResidualTD3:
     sigma = np.full(N_JOINTS, settings.noise)
     model = ResidualTD3(
@@ -246,7 +250,7 @@ def _make_model(
         tau=settings.tau,
         gamma=settings.gamma,
         train_freq=(settings.collect_steps // settings.environments, "step"),
-        # None after the steps: they are made meanwhile.
+        # None after the steps: they overlap with the playing.
         gradient_steps=0,
         action_noise=NormalActionNoise(np.zeros(N_JOINTS), sigma),
         # A time limit is a failure, and critics see it coming: nothing is worth anything beyond.
@@ -268,5 +272,5 @@ def _make_model(
     model.warm_up_steps = settings.warm_up_steps
     model.penalty = settings.penalty
     model.bound = settings.bound
-    environments.meanwhile = model.learn_meanwhile
+    environments.overlapped = model.learn_overlapped
     return model

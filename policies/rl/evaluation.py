@@ -61,7 +61,7 @@ class Evaluation:
         )
 
 
-class Examiner:
+class Evaluator:
     """Plays the first scenes of `SPLIT`, always the same ones.
 
     Attributes:

@@ -21,7 +21,7 @@ from hvs_suite.files import replacing
 from hvs_suite.policies.rl.curves import LoggedCurves
 from hvs_suite.policies.rl.evaluation import (
     Evaluation,
-    Examiner,
+    Evaluator,
     fallen,
     read_evaluations,
     standing,
@@ -196,7 +196,7 @@ class Run:
     Args:
         out: Folder of the run; its state lives in ``out/training``.
         learner: What learns.
-        examiner: Evaluates it.
+        evaluator: Evaluates it.
         on_progress: Called after every iteration and every episode of an evaluation.
     """
 
@@ -204,13 +204,13 @@ class Run:
         self,
         out: Path,
         learner: Learner,
-        examiner: Examiner,
+        evaluator: Evaluator,
         on_progress: Callable[[Progress], None] | None,
     ) -> None:
         self._training = out / "training"
         self._learner = learner
         self._model = model = learner.model
-        self._examiner = examiner
+        self._evaluator = evaluator
         self._on_progress = on_progress
         self._counters: Counters = load_run(self._training, model)
         # Share of the budget, environment steps and seconds after each of the last iterations.
@@ -287,12 +287,12 @@ class Run:
     def _evaluate(self) -> None:
         """Play greedily, film scene 0, keep the figures, and the policy if it is to be kept."""
         env_steps = self._model.num_timesteps
-        evaluation = self._examiner.evaluate(
+        evaluation = self._evaluator.evaluate(
             self._learner.policy(),
             env_steps,
             self._model._n_updates,
             self._training / "clips" / f"{env_steps:010d}.mp4",
-            lambda done: self._report("evaluating", done / self._examiner.episodes),
+            lambda done: self._report("evaluating", done / self._evaluator.episodes),
         )
         self._evaluations.append(evaluation)
         write_evaluations(self._training / "evaluations.json", self._evaluations)

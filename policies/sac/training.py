@@ -16,7 +16,7 @@ from gymnasium import spaces
 from stable_baselines3 import SAC
 
 from hvs_suite.errors import OptionError
-from hvs_suite.policies.rl.evaluation import Examiner
+from hvs_suite.policies.rl.evaluation import Evaluator
 from hvs_suite.policies.rl.journal import Journal, make_journal
 from hvs_suite.policies.rl.run import Budget, Outcome, Progress, Run, check_run
 from hvs_suite.policies.sac.network import policy_kwargs
@@ -108,8 +108,8 @@ def train_sac(
         model = _make_model(journal, settings, seed, device)
         assert isinstance(model.observation_space, spaces.Dict)
         write_config(out, spec, model.observation_space, settings.hidden)
-        examiner = stack.enter_context(contextlib.closing(Examiner(spec, options, eval_episodes)))
-        run = Run(out, _Sac(out, model), examiner, on_progress)
+        evaluator = stack.enter_context(contextlib.closing(Evaluator(spec, options, eval_episodes)))
+        run = Run(out, _Sac(out, model), evaluator, on_progress)
         stack.callback(run.close)
         run.train(limit, settings.collect_steps, eval_every, checkpoint_period_s)
         return run.outcome()
