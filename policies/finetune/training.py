@@ -11,7 +11,7 @@ import dataclasses
 import json
 import math
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +44,7 @@ from hvs_suite.policies.rl.curriculum import Curriculum, Kind, levels_of
 from hvs_suite.policies.rl.evaluation import Evaluation, Evaluator
 from hvs_suite.policies.rl.journal import OUTCOMES, Journal
 from hvs_suite.policies.rl.run import Budget, Outcome, Progress, Run, check_run
-from hvs_suite.policies.training.allocator import keep_freed_memory
+from hvs_suite.policies.training.process import prepare_process
 from hvs_suite.policies.training.run_folder import claimed, write_train_config
 from hvs_suite.registry import find
 from hvs_suite.rollout import library_seeds, worker_conditions
@@ -108,8 +108,7 @@ def finetune(
     levels = levels_of(task, curriculum) if curriculum is not None else [{}]
     check_fit(read_config(policy), policy, spec)
     load_base(policy)
-    keep_freed_memory()
-    torch.set_num_threads(min(2, torch.get_num_threads()))
+    prepare_process()
     identity = {
         "base": weights_digest(policy),
         "task": task,
@@ -124,38 +123,61 @@ def finetune(
         stack.enter_context(claimed(out, identity))
         budget = {"minutes": minutes, "steps": steps}
         write_train_config(out, identity, budget, PACKAGES, policy=name_of(policy))
-        training = out / "training"
-
-        def on_eyes(stage: str, share: float) -> None:
-            if on_progress is not None:
-                on_progress(Progress(stage, share, 0, 0, 0.0, math.nan, math.nan, None))
-
         # Torch and SB3 draw from the global generators of NumPy and torch.
         stack.enter_context(library_seeds(seed))
         evaluator = stack.enter_context(contextlib.closing(Evaluator(spec, options, eval_episodes)))
-
-        def examine(checkpoint: Path, frames: int, updates: int) -> Evaluation:
-            return evaluator.evaluate(
-                CheckpointPolicy(checkpoint, spec),
-                frames,
-                updates,
-                on_episode=lambda done: on_eyes("evaluating", done / eval_episodes),
-            )
-
-        base = train_eyes(
-            policy, training / "eyes", spec, options, split, seed, settings, examine, on_eyes
-        )
-        if settings.environments > 1:
-            # They and the learner play and learn at the same time.
-            torch.set_num_threads(1)
-        environments = _environments(MakeStage(task, options, levels, split, base, settings, seed))
-        stack.callback(environments.close)
-        model = _make_model(environments, load_base(base), settings, seed)
-        learner = _Finetuned(model, base, out, spec)
+        make = MakeStage(task, options, levels, split, policy, settings, seed)
+        base = _with_new_eyes(make, out / "training" / "eyes", spec, evaluator, on_progress)
+        learner = stack.enter_context(_learner(dataclasses.replace(make, base=base), out, spec))
         run = Run(out, learner, evaluator, on_progress)
         stack.callback(run.close)
         run.train(limit, settings.collect_steps, eval_every, checkpoint_period_s)
         return run.outcome()
+
+
+def _with_new_eyes(
+    make: "MakeStage",
+    folder: Path,
+    spec: Spec,
+    evaluator: Evaluator,
+    on_progress: Callable[[Progress], None] | None,
+) -> Path:
+    """The base with the eyes that RL is to begin with: its own, or better ones."""
+
+    def on_share(stage: str, share: float) -> None:
+        if on_progress is not None:
+            on_progress(Progress(stage, share, 0, 0, 0.0, math.nan, math.nan, None))
+
+    def evaluate(checkpoint: Path, frames: int, updates: int) -> Evaluation:
+        return evaluator.evaluate(
+            CheckpointPolicy(checkpoint, spec),
+            frames,
+            updates,
+            on_episode=lambda done: on_share("evaluating", done / evaluator.episodes),
+        )
+
+    return train_eyes(
+        make.base,
+        folder,
+        spec,
+        make.options,
+        make.split,
+        make.seed,
+        make.settings,
+        evaluate,
+        on_share,
+    )
+
+
+@contextlib.contextmanager
+def _learner(make: "MakeStage", out: Path, spec: Spec) -> Iterator["_Finetuned"]:
+    """The model on its environments, which are closed in the end."""
+    if make.settings.environments > 1:
+        # They and the learner play and learn at the same time.
+        torch.set_num_threads(1)
+    with contextlib.closing(_environments(make)) as environments:
+        model = _make_model(environments, load_base(make.base), make.settings, make.seed)
+        yield _Finetuned(model, make.base, out, spec)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,7 +22,7 @@ from hvs_suite.policies.rl.run import Budget, Outcome, Progress, Run, check_run
 from hvs_suite.policies.sac.network import policy_kwargs
 from hvs_suite.policies.sac.playing import GreedyActor, save_actor, write_config
 from hvs_suite.policies.sac.settings import Settings
-from hvs_suite.policies.training.allocator import keep_freed_memory
+from hvs_suite.policies.training.process import prepare_process
 from hvs_suite.policies.training.run_folder import claimed, write_train_config
 from hvs_suite.registry import find
 from hvs_suite.rollout import library_seeds
@@ -88,8 +88,7 @@ def train_sac(
     limit = Budget(steps, minutes)
     check_run(seed, split, eval_every, eval_episodes)
     _check(spec, device)
-    keep_freed_memory()
-    torch.set_num_threads(min(2, torch.get_num_threads()))
+    prepare_process()
     identity = {
         "task": task,
         "task_version": spec.version,

@@ -307,6 +307,11 @@ class Spec(Timing, Cameras, Disturbances):
         return min(bound for name, bound in self.step_bounds.items() if units[name] == "mm")
 
     @property
+    def fps(self) -> int:
+        """Control steps a second, to the nearest whole number: what datasets and players call it."""
+        return round(1.0 / self.control_period_s)
+
+    @property
     def landing_metric(self) -> Metric | None:
         """The distance from the goal in its plane that counts; None where nothing lands."""
         return None
