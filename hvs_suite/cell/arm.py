@@ -53,16 +53,6 @@ class Iiwa7(composer.Entity):
         return self._root.find("body", "link_7")
 
     @property
-    def base_body(self) -> Any:
-        """The base link, standing on the mounting plane."""
-        return self._root.find("body", "base")
-
-    @property
-    def collision_geoms(self) -> tuple[Any, ...]:
-        """All collision geoms, base included."""
-        return tuple(g for g in self._root.find_all("geom") if str(g.name).find("collision") >= 0)
-
-    @property
     def shell_geoms(self) -> tuple[Any, ...]:
         """The visual geoms; empty without shells."""
         return self._shell_geoms

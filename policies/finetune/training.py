@@ -43,7 +43,8 @@ from hvs_suite.policies.hvs.network import N_JOINTS, HvsNetwork
 from hvs_suite.policies.rl.curriculum import Curriculum, Kind, levels_of
 from hvs_suite.policies.rl.evaluation import Evaluation, Evaluator
 from hvs_suite.policies.rl.journal import OUTCOMES, Journal
-from hvs_suite.policies.rl.run import Budget, Outcome, Progress, Run, check_run
+from hvs_suite.policies.rl.run import Outcome, Progress, Run, check_run
+from hvs_suite.policies.training.budget import Budget
 from hvs_suite.policies.training.process import prepare_process
 from hvs_suite.policies.training.run_folder import claimed, write_train_config
 from hvs_suite.registry import find

@@ -29,6 +29,7 @@ from hvs_suite.policies.imitation.settings import (
     take_eyes,
 )
 from hvs_suite.policies.imitation.state import Counters, load_state, save_state
+from hvs_suite.policies.training.budget import Budget
 from hvs_suite.policies.training.curves import Curves
 from hvs_suite.policies.training.plot import draw_run
 from hvs_suite.policies.training.process import prepare_process
@@ -138,7 +139,9 @@ def pretrain(
             this run. With room again, the same command goes on from the last checkpoint.
         PolicyError: The eyes do not fit, or the loss is no number any more.
     """
-    _check_numbers(minutes, steps, workers)
+    budget = Budget(steps, minutes)
+    if workers < 1:
+        raise OptionError(f"workers must be at least 1, not {workers}")
     manifest = read_manifest(data)
     refuse_test_split(manifest)
     chosen = settings_for(manifest, eyes, settings)
@@ -171,7 +174,7 @@ def pretrain(
             policy,
             demonstrations,
             chosen,
-            budget=_Budget(steps, None if minutes is None else 60.0 * minutes),
+            budget=budget,
             rounds=_Rounds(
                 training / "dagger", chosen.dagger_rounds, chosen.dagger_frames, workers
             ),
@@ -182,23 +185,6 @@ def pretrain(
             temporary.write_text(json.dumps(dataclasses.asdict(outcome), indent=2) + "\n")
         draw_run(out)
         return outcome
-
-
-@dataclasses.dataclass(frozen=True)
-class _Budget:
-    """How long to train: steps, seconds, or whichever is reached first."""
-
-    steps: int | None
-    seconds: float | None
-
-    def share(self, counters: Counters) -> float:
-        """Part that is used up, 1 at the end."""
-        shares = [0.0]
-        if self.steps is not None:
-            shares.append(counters.step / self.steps)
-        if self.seconds is not None:
-            shares.append(counters.elapsed_s / self.seconds)
-        return max(shares)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -251,7 +237,7 @@ class _Run:
         demonstrations: Demonstrations,
         settings: Settings,
         *,
-        budget: _Budget,
+        budget: Budget,
         rounds: _Rounds,
         checkpoint_period_s: float,
     ) -> None:
@@ -267,13 +253,13 @@ class _Run:
                 break
         order = _Order(demonstrations.training, batch_size, settings.seed)
         before_s = self._counters.elapsed_s
-        begun = budget.share(self._counters)
+        begun = self._share(budget)
         started = last_checkpoint = time.perf_counter()
         recent: list[float] = []
         policy.train()
         curves = Curves(self._out / "training" / "tensorboard", self._counters.step)
         try:
-            while (share := budget.share(self._counters)) < 1.0:
+            while (share := self._share(budget)) < 1.0:
                 if len(self._rounds) < len(due) and share >= due[len(self._rounds)]:
                     paused = time.perf_counter()
                     self._checkpoint(policy, optimizer, demonstrations, state, curves)
@@ -307,10 +293,14 @@ class _Run:
                 if now - last_checkpoint >= checkpoint_period_s:
                     self._checkpoint(policy, optimizer, demonstrations, state, curves)
                     last_checkpoint = time.perf_counter()
-                self._report_training(budget.share(self._counters), begun)
+                self._report_training(self._share(budget), begun)
             self._checkpoint(policy, optimizer, demonstrations, state, curves)
         finally:
             curves.close()
+
+    def _share(self, budget: Budget) -> float:
+        """Part of the budget that is used up, 1 at the end."""
+        return budget.share(self._counters.step, self._counters.elapsed_s)
 
     def _step(
         self,
@@ -510,13 +500,3 @@ def _held_out(policy: "HvsPolicy", demonstrations: Demonstrations) -> dict[str, 
                 sums[name] = sums.get(name, 0.0) + value * len(part)
     policy.train()
     return {name: value / len(indices) for name, value in sums.items()}
-
-
-def _check_numbers(minutes: float | None, steps: int | None, workers: int) -> None:
-    if workers < 1:
-        raise OptionError(f"workers must be at least 1, not {workers}")
-    if minutes is None and steps is None:
-        raise OptionError("say how long to train: give minutes or steps")
-    for name, value in (("minutes", minutes), ("steps", steps)):
-        if value is not None and not (value > 0 and math.isfinite(value)):
-            raise OptionError(f"{name} must be above 0, not {value}")

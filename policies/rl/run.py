@@ -30,6 +30,7 @@ from hvs_suite.policies.rl.evaluation import (
 from hvs_suite.policies.rl.journal import OUTCOMES
 from hvs_suite.policies.rl.plot import draw_rl_run
 from hvs_suite.policies.rl.state import Counters, Model, load_run, save_run
+from hvs_suite.policies.training.budget import Budget
 from hvs_suite.policies.training.curves import Curves
 from hvs_suite.rollout import Policy
 from hvs_suite.tasks.shared.scenario import TEST_SPLIT
@@ -138,35 +139,6 @@ class Outcome:
         if self.evaluation is not None:
             lines.append(f"last evaluation: {self.evaluation.in_words()}")
         return "\n".join(lines)
-
-
-@dataclasses.dataclass(frozen=True)
-class Budget:
-    """How long to train: environment steps, minutes, or whichever is reached first.
-
-    Raises:
-        OptionError: Neither is given, or one makes no sense.
-    """
-
-    steps: int | None
-    minutes: float | None
-
-    def __post_init__(self) -> None:
-        """Refuse what is no budget."""
-        if self.minutes is None and self.steps is None:
-            raise OptionError("say how long to train: give minutes or steps")
-        for name, value in (("minutes", self.minutes), ("steps", self.steps)):
-            if value is not None and not (value > 0 and math.isfinite(value)):
-                raise OptionError(f"{name} must be above 0, not {value}")
-
-    def share(self, env_steps: int, elapsed_s: float) -> float:
-        """Part that is used up, 1 at the end."""
-        shares = [0.0]
-        if self.steps is not None:
-            shares.append(env_steps / self.steps)
-        if self.minutes is not None:
-            shares.append(elapsed_s / (60.0 * self.minutes))
-        return max(shares)
 
 
 def check_run(seed: int, split: str, eval_every: int, eval_episodes: int) -> None:

@@ -308,7 +308,7 @@ class Spec(Timing, Cameras, Disturbances):
 
     @property
     def fps(self) -> int:
-        """Control steps a second, to the nearest whole number: what datasets and players call it."""
+        """Control steps a second, to the nearest whole number."""
         return round(1.0 / self.control_period_s)
 
     @property
@@ -353,11 +353,6 @@ class Spec(Timing, Cameras, Disturbances):
     def reach_m(self) -> float:
         """Largest distance of a goal from the base's axis (m), which scales shaped rewards."""
         return 0.78
-
-    @property
-    def camera_names(self) -> tuple[str, ...]:
-        """Observations that are colour pictures, in order."""
-        return tuple(name for name in observation_names(self.observations) if name in CAMERA_NAMES)
 
     @property
     def scene_fields(self) -> tuple[str, ...]:
