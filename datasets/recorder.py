@@ -17,13 +17,12 @@ from hvs_suite.datasets.features import dataset_features
 from hvs_suite.datasets.metadata import (
     METADATA_FILE,
     DatasetMetadata,
-    jsonable,
     read_metadata,
     write_metadata,
 )
 from hvs_suite.errors import DatasetError, HvsError, OptionError, OutputError, ScenarioError
 from hvs_suite.names import check_name
-from hvs_suite.registry import find
+from hvs_suite.registry import find, options_of
 from hvs_suite.rollout import play
 from hvs_suite.tasks.shared.lock import digest
 from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
@@ -105,7 +104,7 @@ def record(
         task=task,
         task_version=spec.version,
         split=split,
-        options=jsonable(options or {}),
+        options=options_of(spec),
         noise=float(noise),
         command=command,
         task_digest=digest(task),
@@ -123,7 +122,7 @@ def record(
         tracker = _Tracker(len(outcomes), sum(outcomes), episodes, progress)
         writer = DatasetWriter(root, features, spec.fps, spec.instruction(), block)
         played = play(
-            MakeEnvironment(task, split, dict(options or {})),
+            MakeEnvironment(task, split, metadata.options),
             make_demonstrator,
             range(len(outcomes), episodes),
             Demonstrate(noise),

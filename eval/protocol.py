@@ -1,4 +1,7 @@
-"""How a policy is scored: scenarios 0..N-1 of a split, the task as named, every episode a row."""
+"""How a policy is scored: scenarios 0..N-1 of a split, the task as named, every episode a row.
+
+Studies may change the task by options; the result says so, and is no score then.
+"""
 
 import contextlib
 import dataclasses
@@ -22,8 +25,10 @@ from hvs_suite.eval.scoring.trial import (
     check_decision_limit,
 )
 from hvs_suite.eval.serving import policy_process
+from hvs_suite.policies import catalogue
 from hvs_suite.tasks.shared import lock
 from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
+from hvs_suite.tasks.shared.spec import Spec
 
 LOGGED_OF_BUILTIN = 100
 """Scenarios that the log of a built-in policy holds: it can play the others again."""
@@ -38,6 +43,7 @@ def evaluate(
     *,
     split: str = TEST_SPLIT,
     episodes: int = TEST_SCENARIOS,
+    options: Mapping[str, Any] = catalogue.AS_NAMED,
     workers: int = 1,
     decision_limit_s: float = DECISION_LIMIT_S,
     progress: Progress | None = None,
@@ -49,12 +55,15 @@ def evaluate(
     come in an order drawn for this run: no policy learns by counting which one it plays.
 
     Args:
-        policy: What `hvs_suite.policies.catalogue.policy_factory` takes, or a contender.
-        task: Named task, played as named.
+        policy: What `hvs_suite.policies.catalogue.policy_factory` takes, or a contender that was
+            found for the task and the options.
+        task: Named task.
         out: Result file to write (JSON); the action log and, meanwhile, what is already played
             stand beside it. None writes nothing.
         split: Split to play; ``test`` for a score, any other name for a look.
         episodes: Scenarios to play: 0 to `episodes` - 1.
+        options: Options of the task that differ from the named one, for studies; only the task as
+            named is a score.
         workers: Processes; the episodes are the same for any number.
         decision_limit_s: Time after which a decision loses its episode (s).
         progress: Called after each episode, in the order in which they end; at once for those that
@@ -67,7 +76,8 @@ def evaluate(
         UnknownTaskError: There is no such task.
         PolicyError: There is no such policy, or it does not fit the task.
         ScenarioError: The split does not hold that many scenarios.
-        OptionError: `episodes` or `workers` is below 1, or the time limit is no time limit.
+        OptionError: `episodes` or `workers` is below 1, the time limit is no time limit, or an
+            option of the task makes no sense.
         OutputError: The result cannot be written, another process is writing it, or the beginning
             of another one is in its place.
         RenderError: Nothing here can draw the images.
@@ -75,11 +85,15 @@ def evaluate(
     """
     _check_counts(split, episodes, workers)
     check_decision_limit(decision_limit_s)
-    player = contender.find(policy, task) if isinstance(policy, str) else policy
+    spec = registry.find(task).with_options(options)
+    options = registry.options_of(spec)
+    if spec.action_mode == "flange_twist":
+        raise OptionError("action_mode=flange_twist has six numbers; an action log holds seven")
+    player = contender.find(policy, task, options) if isinstance(policy, str) else policy
     make = player.make
     if player.kind == "module":
         make = policy_process.ProcessFactory(player.name, str(Path.cwd()), task, decision_limit_s)
-    evaluation = _Evaluation.of(player, task, split, decision_limit_s)
+    evaluation = _Evaluation.of(player, spec, split, decision_limit_s)
     partial = None if out is None else out.with_name(out.name + progress_file.SUFFIX)
     if out is not None:
         files.check_writable(out)
@@ -88,7 +102,7 @@ def evaluate(
         wall_s = _play_rest(
             kept,
             rollout.play(
-                MakeTask(task, split),
+                MakeTask(task, split, options),
                 make,
                 [index for index in order if index not in kept.trials],
                 PlayTrial(decision_limit_s, kept.salt),
@@ -113,24 +127,25 @@ class _Evaluation:
 
     Attributes:
         player: Who plays.
-        task: Named task.
+        spec: The task.
         split: Split its scenarios come from.
         created: When this sitting began.
         origin: The part of a result's metadata on which its trials depend.
     """
 
     player: Contender
-    task: str
+    spec: Spec
     split: str
     created: str
     origin: Mapping[str, Any]
 
     @classmethod
-    def of(cls, player: Contender, task: str, split: str, decision_limit_s: float) -> Self:
+    def of(cls, player: Contender, spec: Spec, split: str, decision_limit_s: float) -> Self:
         """Note what an evaluation here and now depends on."""
         created = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
         origin = {
-            "task_digest": lock.digest(task),
+            "task_digest": lock.digest(spec.name),
+            "options": registry.options_of(spec),
             "policy_kind": player.kind,
             "policy_hash": player.hash,
             "decision_limit_s": decision_limit_s,
@@ -139,13 +154,13 @@ class _Evaluation:
             "gl_renderer": provenance.gl_renderer(),
             "cpu": provenance.cpu(),
         }
-        return cls(player, task, split, created, origin)
+        return cls(player, spec, split, created, origin)
 
     def identity(self) -> dict[str, Any]:
         """What an interrupted evaluation must have in common with the one that goes on."""
         return {
             "schema_version": result_file.SCHEMA_VERSION,
-            "task": self.task,
+            "task": self.spec.name,
             "split": self.split,
             "policy": self.player.name,
             **self.origin,
@@ -155,9 +170,10 @@ class _Evaluation:
         self, trials: Sequence[Trial], timings: result_file.Timings
     ) -> tuple[result_file.Result, bytes]:
         """The result of all trials, and their action log."""
-        player, spec = self.player, registry.find(self.task)
+        player, spec = self.player, self.spec
         rows = [trial.row for trial in trials]
-        n_logged = min(LOGGED_OF_BUILTIN, len(rows)) if player.kind == "builtin" else len(rows)
+        plays_again = player.kind == "builtin" and not self.origin["options"]
+        n_logged = min(LOGGED_OF_BUILTIN, len(rows)) if plays_again else len(rows)
         log = action_log.encode([trial.actions for trial in trials[:n_logged]])
         judged_by: dict[str, Any] = {
             "tolerances": spec.tolerances,
@@ -165,11 +181,10 @@ class _Evaluation:
         }
         result = result_file.Result(
             schema_version=result_file.SCHEMA_VERSION,
-            summary=result_file.Summary.of(self.task, player.name, self.split, rows, **judged_by),
+            summary=result_file.Summary.of(spec.name, player.name, self.split, rows, **judged_by),
             metadata=result_file.Metadata(
                 created=self.created,
                 task_version=spec.version,
-                options={},
                 policy_parameters=player.parameters,
                 training_steps=player.training_steps,
                 training_hours=player.training_hours,

@@ -17,7 +17,7 @@ from hvs_suite.errors import ResultError
 from hvs_suite.eval.board.submission import Submission
 from hvs_suite.eval.scoring import result_file
 from hvs_suite.eval.scoring.result_file import Result
-from hvs_suite.eval.scoring.verification import check_task
+from hvs_suite.eval.scoring.verification import check_as_named, check_task
 
 
 def check(submissions: Sequence[Submission], folder: Path) -> dict[str, Result]:
@@ -41,6 +41,7 @@ def check(submissions: Sequence[Submission], folder: Path) -> dict[str, Result]:
         if not path.exists():
             continue
         rerun, result = result_file.load(path), entry.result
+        check_as_named(path, rerun)
         check_task(path, rerun)
         for what, theirs, ours in (
             ("task", rerun.summary.task, result.summary.task),

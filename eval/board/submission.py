@@ -13,8 +13,8 @@ from hvs_suite.eval.board import ours
 from hvs_suite.eval.scoring import action_log, result_file
 from hvs_suite.eval.scoring.action_log import Actions
 from hvs_suite.eval.scoring.result_file import Result
-from hvs_suite.eval.scoring.verification import check_task, load_actions
-from hvs_suite.names import check_name
+from hvs_suite.eval.scoring.verification import check_as_named, check_task, load_actions
+from hvs_suite.names import check_name, look_alike
 from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
 
 # Its ten places come round again after ten scenarios.
@@ -31,7 +31,8 @@ class Submission:
     Attributes:
         path: ``<results>/<policy>/<task>.json``.
         result: What it holds.
-        executed: Its actions, as `action_log.executed` gives them.
+        executed: Its actions up to where each scenario was scored, as `action_log.executed` gives
+            them.
     """
 
     path: Path
@@ -62,6 +63,7 @@ def check(
     for path in wanted - {path.resolve() for path in files}:
         raise ResultError(f"{path}: a submission lies as {results}/<policy>/<task>.json")
     tasks = {path.stem for path in wanted}
+    folders = {path.parent.name for path in files}
     submissions: list[Submission] = []
     standing: list[Submission] = []
     # Only results of one task are ever held against each other.
@@ -69,9 +71,11 @@ def check(
         result = result_file.load(path)
         if path.resolve() in wanted:
             _check_alone(path, result, results, draft=draft)
-        actions = load_actions(path, result)
+            _check_passes_for_nobody(path, folders)
+        log = load_actions(path, result)
+        scored = [actions[: row.steps] for actions, row in zip(log, result.episodes, strict=False)]
         entry = Submission(
-            path, result, action_log.executed(actions, result.metadata.time_limit_steps)
+            path, result, action_log.executed(scored, result.metadata.time_limit_steps)
         )
         for other in standing:
             if path.resolve() in wanted:
@@ -115,11 +119,24 @@ def _check_alone(path: Path, result: Result, results: Path, *, draft: bool) -> N
     check_name(path.parent.name, f"{path}: the folder's name", error=ResultError)
     check_name(result.summary.policy, f"{path}: summary.policy", error=ResultError)
     _check_place(path, result, results)
+    check_as_named(path, result)
     check_task(path, result)
     if not draft:
         _check_score(path, result)
         _check_metadata(path, result)
         ours.check(path, result)
+
+
+def _check_passes_for_nobody(path: Path, folders: set[str]) -> None:
+    """Checks that a name in letters of another alphabet is not somebody else's to the eye.
+
+    Raises:
+        ResultError: It is.
+    """
+    name = path.parent.name
+    twin = None if name.isascii() else look_alike(name, sorted(folders - {name}))
+    if twin is not None:
+        raise ResultError(f"{path}: {name!r} passes for {twin!r}; choose another name")
 
 
 def _check_place(path: Path, result: Result, results: Path) -> None:

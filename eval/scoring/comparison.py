@@ -8,7 +8,9 @@ from hvs_suite import reading, registry, statistics
 from hvs_suite.errors import ResultError
 from hvs_suite.eval.scoring import lerobot_import, result_file
 from hvs_suite.eval.scoring.result_file import EpisodeRow
+from hvs_suite.names import shown
 from hvs_suite.statistics import Difference
+from hvs_suite.tasks.shared.option_types import listed
 
 SIGNIFICANT = 0.05
 
@@ -22,6 +24,7 @@ class Side:
         task: Named task.
         split: Split.
         digest: Digest of the task; None where the file does not tell (imported).
+        options: Options that changed the task, in words; None where the file does not tell.
         success: Outcome by scenario.
         rows: Rows by scenario; empty for an imported result.
     """
@@ -30,6 +33,7 @@ class Side:
     task: str
     split: str
     digest: str | None
+    options: str | None
     success: Mapping[int, bool]
     rows: Mapping[int, EpisodeRow]
 
@@ -39,7 +43,7 @@ class Comparison:
     """Two policies, A and B, over the scenarios that both played.
 
     Attributes:
-        task: Named task.
+        task: Named task, and the options that changed it.
         a: Name of the first policy.
         b: Name of the second.
         n: Scenarios that both played.
@@ -155,6 +159,7 @@ def compare(first: Path, second: Path) -> Comparison:
         ("task", a.task, b.task),
         ("split", a.split, b.split),
         ("task_digest", a.digest, b.digest),
+        ("the task's options", a.options, b.options),
     ):
         if ours != theirs and None not in (ours, theirs):
             raise ResultError(
@@ -172,7 +177,7 @@ def compare(first: Path, second: Path) -> Comparison:
     ]
     names = (a.name, b.name) if a.name != b.name else (f"{a.name} (A)", f"{b.name} (B)")
     return Comparison(
-        task=a.task,
+        task=f"{a.task} with {shown(a.options)}" if a.options else a.task,
         a=names[0],
         b=names[1],
         n=len(common),
@@ -217,6 +222,7 @@ def load_side(path: Path) -> Side:
             task=claim.summary.task,
             split=claim.summary.split,
             digest=None,
+            options=None,
             success={row.scenario: row.success for row in claim.episodes},
             rows={},
         )
@@ -226,6 +232,7 @@ def load_side(path: Path) -> Side:
         task=result.summary.task,
         split=result.summary.split,
         digest=result.metadata.task_digest,
+        options=listed(result.metadata.options),
         success={row.scenario: row.success for row in result.episodes},
         rows={row.scenario: row for row in result.episodes},
     )

@@ -4,13 +4,13 @@ Light to import: a policy's own process starts with this, and holds nothing of t
 """
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from hvs_suite import registry
 from hvs_suite.errors import PolicyError
 from hvs_suite.eval.scoring import provenance
-from hvs_suite.policies.catalogue import policy_factory
+from hvs_suite.policies.catalogue import AS_NAMED, policy_factory
 from hvs_suite.policies.context import Blindfolded
 from hvs_suite.policies.imported import ImportedFactory
 from hvs_suite.rollout import PolicyFactory
@@ -42,19 +42,20 @@ class Contender:
     training_hours: float | None = None
 
 
-def find(policy: str, task: str) -> Contender:
+def find(policy: str, task: str, options: Mapping[str, Any] = AS_NAMED) -> Contender:
     """Finds the policy behind a name.
 
     Args:
         policy: As `policy_factory` takes it.
         task: Named task.
+        options: Options that it is played with, where they differ from it.
 
     Raises:
         UnknownTaskError: There is no such task.
+        OptionError: An option does not exist or its value makes no sense.
         PolicyError: There is no such policy, or it does not fit the task.
     """
-    registry.find(task)
-    make = policy_factory(policy, task)
+    make = policy_factory(policy, task, options)
     # An absolute path would tell who ran it and where.
     name = Path(policy).name if Path(policy).is_absolute() else policy
     if isinstance(make, ImportedFactory):

@@ -6,19 +6,21 @@ successes under the same keys as ours, marked ``"verified": false``; it can be c
 """
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import pydantic
 
 from hvs_suite import files, reading, registry, statistics
-from hvs_suite.errors import ResultError
+from hvs_suite.errors import OptionError, ResultError
 from hvs_suite.eval.scoring.result_file import MOST_BYTES
 from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
 
 LEROBOT_SEED = 1000
 """``lerobot-eval`` counts its seeds up from here unless told otherwise (``--seed``)."""
+
+
+Reward = Annotated[float, pydantic.Field(allow_inf_nan=False)]
 
 
 class _Block(pydantic.BaseModel):
@@ -37,8 +39,8 @@ class ImportedRow(_Block):
 
     scenario: Annotated[int, pydantic.Field(ge=0)]
     success: bool
-    sum_reward: float
-    max_reward: float
+    sum_reward: Reward
+    max_reward: Reward
 
 
 class ImportedSummary(_Block):
@@ -104,6 +106,57 @@ class ImportedResult(_Block):
         )
 
 
+class _Episode(pydantic.BaseModel):
+    success: bool
+    sum_reward: Reward
+    max_reward: Reward
+
+
+class _Overall(pydantic.BaseModel):
+    pc_success: Reward
+
+
+class _Older(pydantic.BaseModel):
+    """What ``lerobot-eval`` wrote when it knew one task: a row an episode."""
+
+    per_episode: Annotated[list[_Episode], pydantic.Field(min_length=1)]
+    overall: Annotated[_Overall, pydantic.Field(alias="aggregated")]
+
+    def episodes(self) -> list[_Episode]:
+        return self.per_episode
+
+
+class _Metrics(pydantic.BaseModel):
+    successes: Annotated[list[bool], pydantic.Field(min_length=1)]
+    sum_rewards: list[Reward]
+    max_rewards: list[Reward]
+
+    @pydantic.model_validator(mode="after")
+    def _agree(self) -> Self:
+        if not len(self.successes) == len(self.sum_rewards) == len(self.max_rewards):
+            raise ValueError("successes and rewards do not belong together")
+        return self
+
+
+class _Task(pydantic.BaseModel):
+    metrics: _Metrics
+
+
+class _Newer(pydantic.BaseModel):
+    """What it writes now: columns, by task."""
+
+    per_task: Annotated[list[_Task], pydantic.Field(min_length=1, max_length=1)]
+    overall: _Overall
+
+    def episodes(self) -> list[_Episode]:
+        metrics = self.per_task[0].metrics
+        columns = metrics.successes, metrics.sum_rewards, metrics.max_rewards
+        return [
+            _Episode(success=success, sum_reward=total, max_reward=largest)
+            for success, total, largest in zip(*columns, strict=True)
+        ]
+
+
 def read(
     path: Path, *, task: str, policy: str, split: str = TEST_SPLIT, seed: int = LEROBOT_SEED
 ) -> ImportedResult:
@@ -119,27 +172,25 @@ def read(
     Raises:
         ResultError: The file is no such file, holds several tasks, or claims what its own rows do
             not give.
+        OptionError: `seed` is negative.
         UnknownTaskError: There is no such task.
     """
     registry.find(task)
-    content = reading.read_json(path, error=ResultError, most=MOST_BYTES)
-    try:
-        successes, sums, largest, claimed = _lists(content)
-    except (ValueError, KeyError, TypeError, IndexError, OverflowError) as error:
-        raise ResultError(
-            f"{path}: is no eval_info.json of one task, as lerobot-eval writes it ({error!r})"
-        ) from error
-    if not len(successes) == len(sums) == len(largest) > 0:
-        raise ResultError(f"{path}: successes and rewards do not belong together")
-    count = TEST_SCENARIOS if split == TEST_SPLIT else seed + len(successes)
+    if seed < 0:
+        raise OptionError(f"a seed is a whole number from 0 up, not {seed}")
+    content = reading.read_object(path, error=ResultError, most=MOST_BYTES)
+    what = f"{path}: is no eval_info.json of one task, as lerobot-eval writes it"
+    info: _Older | _Newer = (
+        reading.validated(_Older, content, what, error=ResultError)
+        if "per_episode" in content
+        else reading.validated(_Newer, content, what, error=ResultError)
+    )
+    episodes = info.episodes()
+    claimed = info.overall.pc_success
+    count = TEST_SCENARIOS if split == TEST_SPLIT else seed + len(episodes)
     rows = [
-        ImportedRow(
-            scenario=(seed + i) % count,
-            success=success,
-            sum_reward=sums[i],
-            max_reward=largest[i],
-        )
-        for i, success in enumerate(successes)
+        ImportedRow(scenario=(seed + i) % count, **episode.model_dump())
+        for i, episode in enumerate(episodes)
     ]
     if len({row.scenario for row in rows}) < len(rows):
         raise ResultError(f"{path}: holds a scenario twice; {TEST_SCENARIOS} make the test split")
@@ -174,26 +225,3 @@ def load(path: Path) -> ImportedResult:
 def is_imported(content: Any) -> bool:
     """Returns whether a parsed JSON file is an imported result."""
     return isinstance(content, dict) and content.get("origin") == "lerobot-eval"
-
-
-def _lists(content: Mapping[str, Any]) -> tuple[list[bool], list[float], list[float], float]:
-    """Successes, sums and maxima of rewards, and the success rate claimed (percent)."""
-    if "per_episode" in content:
-        rows = content["per_episode"]
-        successes, sums, largest = (
-            [row[name] for row in rows] for name in ("success", "sum_reward", "max_reward")
-        )
-        claimed = content["aggregated"]["pc_success"]
-    else:
-        (task,) = content["per_task"]
-        metrics = task["metrics"]
-        successes, sums, largest = (
-            metrics[name] for name in ("successes", "sum_rewards", "max_rewards")
-        )
-        claimed = content["overall"]["pc_success"]
-    return (
-        [bool(success) for success in successes],
-        [float(reward) for reward in sums],
-        [float(reward) for reward in largest],
-        float(claimed),
-    )

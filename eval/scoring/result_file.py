@@ -25,9 +25,9 @@ SCALES = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 20.0, 50.
 SHARPEST_PERCENT = 95.0
 MOST_BYTES = 16 * 2**20
 """Largest file that is read: a hundred times one of 1,000 scenarios."""
-MOST_EPISODES = 100_000
-MOST_COLUMNS = 100
-"""Columns that are read: three times those of any task. Each becomes a value of every row."""
+MOST_VALUES = 500_000
+"""Episodes times columns that are read: 10,000 episodes of twice the columns of any task. A column
+of a few bytes becomes a value of every row, and of every resample of its interval."""
 
 Count = Annotated[int, pydantic.Field(ge=0)]
 Error = Annotated[float, pydantic.Field(ge=0.0, allow_inf_nan=False)]
@@ -442,6 +442,8 @@ class Result(_Block):
         n_logged, kind = self.metadata.n_logged, self.metadata.policy_kind
         if n_logged > len(self.episodes) or (n_logged < len(self.episodes) and kind != "builtin"):
             raise ValueError("metadata.n_logged must be the number of rows")
+        if n_logged < len(self.episodes) and self.metadata.options:
+            raise ValueError("metadata.n_logged must be the number of rows where there are options")
         ours = self.summary
         theirs = Summary.of(
             ours.task,
@@ -585,10 +587,10 @@ def _episodes(path: Path, content: Mapping[str, Any]) -> list[dict[str, Any]]:
     """
     columns, summary = content.get("episodes"), content.get("summary")
     n = summary.get("n_episodes") if isinstance(summary, dict) else None
-    if not isinstance(columns, dict) or not isinstance(n, int) or not 0 < n <= MOST_EPISODES:
+    if not isinstance(columns, dict) or not isinstance(n, int) or n < 1:
         raise ResultError(f"{path}: holds no columns of episodes; evaluate again")
-    if _n_columns(columns) > MOST_COLUMNS:
-        raise ResultError(f"{path}: holds more than {MOST_COLUMNS} columns of episodes")
+    if n * _n_columns(columns) > MOST_VALUES:
+        raise ResultError(f"{path}: holds more than {MOST_VALUES:,} values of episodes")
     try:
         rows = _rows(columns, n)
     except ValueError as error:

@@ -137,21 +137,24 @@ def outcome(row: EpisodeRow) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class MakeTask:
-    """Builds a named task in whichever process asks for it.
+    """Builds a task in whichever process asks for it.
 
     Attributes:
         task: Named task.
         split: Split its scenarios come from.
+        options: Options that differ from it.
         pictures: Draw the observations; a re-simulation needs none.
     """
 
     task: str
     split: str
+    options: Mapping[str, Any]
     pictures: bool = True
 
     def __call__(self) -> rollout.Environment:
         """Returns a new environment."""
-        options: dict[str, Any] = {} if self.pictures else {"observations": "state"}
+        unseen = {} if self.pictures else {"observations": "state"}
+        options = {**self.options, **unseen}
         env: rollout.Environment = registry.load(self.task, split=self.split, **options)
         return env
 

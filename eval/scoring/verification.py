@@ -9,6 +9,7 @@ import contextlib
 import dataclasses
 import hashlib
 import math
+import os
 import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -32,6 +33,7 @@ from hvs_suite.names import shown
 from hvs_suite.policies import builtin, catalogue
 from hvs_suite.rollout import Action, Observation
 from hvs_suite.tasks.shared import lock
+from hvs_suite.tasks.shared.option_types import listed
 
 NEAR: Mapping[str, float] = {"mm": 1e-3, "deg": 1e-5}
 """Re-simulated metrics may differ by this much, by unit: another processor rounds differently."""
@@ -160,7 +162,9 @@ def verify(
             {index: log[index] for index in scenarios if index < len(log)},
             {index: rows[index] for index in scenarios},
         )
-        task = MakeTask(result.summary.task, result.summary.split, pictures=pictures)
+        task = MakeTask(
+            result.summary.task, result.summary.split, result.metadata.options, pictures=pictures
+        )
         with contextlib.closing(
             rollout.play(task, make, scenarios, replay, workers=workers)
         ) as played:
@@ -211,19 +215,20 @@ def builtin_policy(path: Path, result: Result) -> rollout.PolicyFactory:
 
 
 def check_task(path: Path, result: Result) -> None:
-    """Checks that a result was made on the task as its name means it here.
+    """Checks that a result was made on the task as its name, and its options, mean it here.
 
     Raises:
         ResultError: It was not.
         UnknownTaskError: There is no such task.
     """
-    spec = registry.find(result.summary.task)
     ours, metadata = result.summary.task, result.metadata
-    if metadata.options:
-        options = ", ".join(sorted(metadata.options))
-        raise ResultError(
-            f"{path}: the task was changed ({options}); only the task as named is scored"
-        )
+    named = registry.find(ours)
+    try:
+        spec = named.with_options(metadata.options)
+    except OptionError as error:
+        raise ResultError(f"{path}: metadata.options: {error}") from error
+    if registry.options_of(spec) != metadata.options:
+        raise ResultError(f"{path}: metadata.options are not what differs from {ours}")
     for name, said, known in (
         ("task_version", metadata.task_version, spec.version),
         ("task_digest", metadata.task_digest, lock.digest(ours)),
@@ -236,6 +241,19 @@ def check_task(path: Path, result: Result) -> None:
                 f"{path}: {name} is {said}, but {known} for {ours} in this hvs_suite; evaluate "
                 "again, or check with the version that made it"
             )
+
+
+def check_as_named(path: Path, result: Result) -> None:
+    """Checks that a result is one of the named task, and not of what options made of it.
+
+    Raises:
+        ResultError: It is not.
+    """
+    if result.metadata.options:
+        raise ResultError(
+            f"{path}: the task was changed ({shown(listed(result.metadata.options))}); only the "
+            "task as named is scored"
+        )
 
 
 def load_actions(path: Path, result: Result) -> list[action_log.Actions]:
@@ -328,7 +346,8 @@ def results_in(paths: Sequence[Path]) -> list[Path]:
     for path in paths:
         if not path.exists():
             raise OptionError(f"{path} does not exist; name a result file or a folder of them")
-        found += sorted(path.rglob("*.json")) if path.is_dir() else [path]
+        below = [Path(folder, name) for folder, _, names in os.walk(path) for name in names]
+        found += sorted(f for f in below if f.suffix == ".json") if path.is_dir() else [path]
     if not found:
         raise OptionError("there are no results there; name a result file or a folder of them")
     return found

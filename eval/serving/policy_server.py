@@ -139,7 +139,7 @@ def listening(policy: str, host: str, port: int) -> Iterator[tuple[Server, str]]
             max_queue=1,
             close_timeout=1.0,
         )
-    except (OSError, OverflowError) as error:
+    except (OSError, OverflowError, TypeError, UnicodeError) as error:
         raise OptionError(
             f"cannot listen at {host}, port {port}: {error}; choose another --port or --host"
         ) from error

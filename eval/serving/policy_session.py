@@ -21,7 +21,7 @@ from hvs_suite.eval.scoring import contender
 from hvs_suite.eval.scoring.contender import Contender
 from hvs_suite.eval.serving import wire
 from hvs_suite.policies.context import PolicyContext
-from hvs_suite.registry import TASKS
+from hvs_suite.registry import find
 from hvs_suite.rollout import Policy, library_seeds, one_torch_thread
 from hvs_suite.tasks.shared import lock
 
@@ -105,6 +105,7 @@ def served(name: str, task: Any, message: wire.Message) -> tuple[Contender, Poli
         message: The evaluation's ``hello``.
 
     Raises:
+        OptionError: An option of the task does not exist or makes no sense.
         PolicyError: There is no such policy, it does not fit the task, or it cannot be served.
         ServerError: The evaluation means another version of the task.
         UnknownTaskError: There is no such task here.
@@ -113,7 +114,11 @@ def served(name: str, task: Any, message: wire.Message) -> tuple[Contender, Poli
     contender.check_public(name)
     if not isinstance(task, str):
         raise wire.WireError("hello names a task")
-    player = contender.find(name, task)
+    options = message.get("options", {})
+    if not isinstance(options, dict):
+        raise wire.WireError("hello has options, a map")
+    played = find(task).with_options(options)
+    player = contender.find(name, task, options)
     if message.get("task_digest") != lock.digest(task):
         raise ServerError(f"the evaluation means another version of {task} than this server has")
     try:
@@ -123,8 +128,7 @@ def served(name: str, task: Any, message: wire.Message) -> tuple[Contender, Poli
         action = spec("action", message["action"])
     except (KeyError, TypeError, ValueError) as error:
         raise wire.WireError("hello describes observations and action") from error
-    period_s = TASKS[task].control_period_s
-    return player, PolicyContext(TASKS[task], observations, action, period_s)
+    return player, PolicyContext(played, observations, action, played.control_period_s)
 
 
 def spec(name: str, description: dict[str, Any]) -> specs.BoundedArray:

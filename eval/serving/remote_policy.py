@@ -11,6 +11,7 @@ import dataclasses
 import re
 import time
 import weakref
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 import numpy as np
@@ -33,6 +34,7 @@ from hvs_suite.eval.scoring.trial import (
     check_decision_limit,
 )
 from hvs_suite.eval.serving import wire
+from hvs_suite.policies.catalogue import AS_NAMED
 from hvs_suite.rollout import Action, Observation
 from hvs_suite.tasks.shared import lock
 
@@ -312,7 +314,13 @@ class _WebSocket:
         self._closing.close()
 
 
-def find(url: str, name: str, task: str, decision_limit_s: float = DECISION_LIMIT_S) -> Contender:
+def find(
+    url: str,
+    name: str,
+    task: str,
+    decision_limit_s: float = DECISION_LIMIT_S,
+    options: Mapping[str, Any] = AS_NAMED,
+) -> Contender:
     """Asks a server who it is.
 
     Args:
@@ -320,12 +328,13 @@ def find(url: str, name: str, task: str, decision_limit_s: float = DECISION_LIMI
         name: What the result shall call the policy.
         task: Named task.
         decision_limit_s: Time after which a decision loses the episode (s).
+        options: Options that it is played with, where they differ from it.
 
     Returns:
         The policy; hash, parameters and training are the server's own word.
 
     Raises:
-        OptionError: The address or the time limit makes no sense.
+        OptionError: The address, the time limit or an option makes no sense.
         UnknownTaskError: There is no such task.
         ServerError: There is no such server, or it refuses, or what it says of its policy makes no
             sense.
@@ -333,13 +342,12 @@ def find(url: str, name: str, task: str, decision_limit_s: float = DECISION_LIMI
     check_decision_limit(decision_limit_s)
     try:
         parse_uri(url)
-    except InvalidURI as error:
+    except (InvalidURI, ValueError) as error:
         raise OptionError(
             f"--server takes an address such as ws://127.0.0.1:8765, not {url!r}"
         ) from error
-    registry.find(task)
     make = RemoteFactory(url, task, decision_limit_s)
-    with contextlib.closing(registry.load(task)) as env:
+    with contextlib.closing(registry.load(task, **options)) as env:
         welcome = make(env).welcome
     assert welcome is not None
     return Contender(
@@ -363,6 +371,7 @@ def hello(task: str, env: Any) -> wire.Message:
         "task": task,
         "task_version": spec.version,
         "task_digest": lock.digest(task),
+        "options": registry.options_of(spec),
         "instruction": spec.instruction(),
         "period_s": spec.control_period_s,
         "parameters": dataclasses.asdict(spec),

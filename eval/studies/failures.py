@@ -26,6 +26,7 @@ from hvs_suite.names import shown
 from hvs_suite.policies.checkpoints.files import read_config
 from hvs_suite.policies.checkpoints.loading import load_network, network_inputs
 from hvs_suite.rollout import Action, Observation, one_torch_thread
+from hvs_suite.tasks.shared.option_types import listed
 from hvs_suite.tasks.shared.spec import Spec
 
 if TYPE_CHECKING:
@@ -79,6 +80,7 @@ class Report:
 
     Attributes:
         task: Named task.
+        options: Options that changed it.
         policy: Its name.
         split: Split.
         n_episodes: Scenarios played.
@@ -86,6 +88,7 @@ class Report:
     """
 
     task: str
+    options: Mapping[str, Any]
     policy: str
     split: str
     n_episodes: int
@@ -140,7 +143,8 @@ def sort_failures(
     if checkpoint is not None:
         network = load_network(checkpoint, read_config(checkpoint))
     failures = []
-    with contextlib.closing(registry.load(result.summary.task, split=result.summary.split)) as env:
+    summary, options = result.summary, result.metadata.options
+    with contextlib.closing(registry.load(summary.task, split=summary.split, **options)) as env:
         unlogged = None
         if result.metadata.n_logged < len(result.episodes):
             unlogged = verification.builtin_policy(path, result)(env)
@@ -155,8 +159,9 @@ def sort_failures(
             failures.append(_sort(env, row, list(actions[: row.steps]), network))
             if progress is not None:
                 progress()
-    summary = result.summary
-    return Report(summary.task, summary.policy, summary.split, summary.n_episodes, tuple(failures))
+    return Report(
+        summary.task, options, summary.policy, summary.split, summary.n_episodes, tuple(failures)
+    )
 
 
 def _sort(
@@ -236,8 +241,9 @@ def markdown(reports: Sequence[Report]) -> str:
     lines = []
     for report in reports:
         counts = Counter(failure.cause for failure in report.failures)
+        changed = f" with `{shown(listed(report.options))}`" if report.options else ""
         lines += [
-            f"`{shown(report.policy)}` on `{report.task}`, split `{report.split}`: "
+            f"`{shown(report.policy)}` on `{report.task}`{changed}, split `{report.split}`: "
             f"{len(report.failures)} of {report.n_episodes} lost.",
             "",
         ]

@@ -21,6 +21,8 @@ class Bench:
         recording: Measure recording instead: its rate against bare simulation.
         episodes: Episodes that the expert plays or that are recorded.
         json: Print the figures as JSON.
+        option: Parameter of the task to change for a study, such as target_diameter_m=0.03; give it
+            several times for several.
     """
 
     task: str | None = None
@@ -29,6 +31,7 @@ class Bench:
     recording: bool = False
     episodes: int = 600
     json: bool = False
+    option: tuple[str, ...] = ()
 
     def run(self) -> None:
         """Measure and print."""
@@ -37,40 +40,42 @@ class Bench:
         demonstrations = self.expert or self.recording
         if self.task is None and not demonstrations:
             raise OptionError("say what to measure: --task, such as --task align-easy")
+        from hvs_suite.registry import find
+        from hvs_suite.tasks.shared.option_types import listed
+
         task = self.task or "align-thesis"
+        options = find(task).options_from_text(self.option)
         figures: dict[str, float] = {}
         labels: dict[str, str] = {}
         if demonstrations:
-            self._check_episodes(task)
+            self._check_episodes()
         if self.expert:
             from hvs_suite.cli import bench_expert
 
-            figures |= bench_expert.expert_figures(task, self.episodes)
+            figures |= bench_expert.expert_figures(task, options, self.episodes)
             labels |= bench_expert.LABELS
         if self.recording:
             from hvs_suite.cli import bench_recording
 
-            figures |= bench_recording.recording_figures(task, self.episodes, self.seconds)
+            figures |= bench_recording.recording_figures(task, options, self.episodes, self.seconds)
             labels |= bench_recording.LABELS
         if not demonstrations:
             from hvs_suite.cli import bench_simulation
 
-            figures = bench_simulation.simulation_figures(task, self.seconds)
+            figures = bench_simulation.simulation_figures(task, options, self.seconds)
             labels = bench_simulation.LABELS
         if self.json:
             console.print_json(
-                {"task": task} | {name: round(value, 3) for name, value in figures.items()}
+                {"task": task, "options": options}
+                | {name: round(value, 3) for name, value in figures.items()}
             )
             return
         console.print_table(
-            (task, "measured"),
+            (f"{task} with {listed(options)}" if options else task, "measured"),
             [(label, f"{figures[name]:.2f}") for name, label in labels.items()],
         )
 
-    def _check_episodes(self, task: str) -> None:
+    def _check_episodes(self) -> None:
         """Refuse counts that say nothing or go beyond the test split."""
-        from hvs_suite.registry import find
-
-        find(task)
         if not 2 <= self.episodes <= 1000:
             raise OptionError(f"--episodes is {self.episodes}; use 2 to 1000")

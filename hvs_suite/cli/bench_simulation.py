@@ -32,11 +32,12 @@ LABELS = {
 }
 
 
-def simulation_figures(task: str, seconds: float) -> dict[str, float]:
+def simulation_figures(task: str, options: Mapping[str, Any], seconds: float) -> dict[str, float]:
     """Steps a task in this process, with and without cameras, and in one and two others.
 
     Args:
         task: A named task.
+        options: Options of it.
         seconds: How long to measure each figure (s).
 
     Returns:
@@ -44,12 +45,12 @@ def simulation_figures(task: str, seconds: float) -> dict[str, float]:
     """
     import hvs_suite
 
-    with hvs_suite.load(task) as env:
+    with hvs_suite.load(task, **options) as env:
         figures = against_bare_loop(env, seconds)
-    with hvs_suite.load(task, observations="state") as env:
+    with hvs_suite.load(task, **{**options, "observations": "state"}) as env:
         steps, elapsed_s, _ = play(env, seconds / 2)
         figures["steps_per_s_no_cameras"] = steps / elapsed_s
-    return figures | with_workers(task, seconds)
+    return figures | with_workers(task, options, seconds)
 
 
 def against_bare_loop(env: "Environment", seconds: float) -> dict[str, float]:
@@ -258,18 +259,19 @@ def play(env: "Environment", seconds: float) -> tuple[int, float, int]:
     return steps, elapsed_s, episodes
 
 
-def with_workers(task: str, seconds: float) -> dict[str, float]:
+def with_workers(task: str, options: Mapping[str, Any], seconds: float) -> dict[str, float]:
     """Compare two worker processes with one, in turns.
 
     Args:
         task: A named task.
+        options: Options of it.
         seconds: How long to measure one, and two (s).
 
     Returns:
         ``one_worker_steps_per_s``, ``two_worker_steps_per_s`` and ``two_worker_speedup``.
     """
     one, two = [], []
-    with _worker(task) as first, _worker(task) as second:
+    with _worker(task, options) as first, _worker(task, options) as second:
         for _ in range(WORKER_ROUNDS):
             one.append(_rate([first], seconds / WORKER_ROUNDS))
             two.append(_rate([first, second], seconds / WORKER_ROUNDS))
@@ -280,23 +282,24 @@ def with_workers(task: str, seconds: float) -> dict[str, float]:
     }
 
 
-def two_worker_rate(task: str, seconds: float) -> float:
+def two_worker_rate(task: str, options: Mapping[str, Any], seconds: float) -> float:
     """Steps per second of two worker processes together.
 
     Args:
         task: A named task.
+        options: Options of it.
         seconds: How long to measure (s).
     """
-    with _worker(task) as first, _worker(task) as second:
+    with _worker(task, options) as first, _worker(task, options) as second:
         return _rate([first, second], seconds)
 
 
 @contextlib.contextmanager
-def _worker(task: str) -> Iterator[Connection]:
+def _worker(task: str, options: Mapping[str, Any]) -> Iterator[Connection]:
     """A process that plays a task whenever it is sent a duration."""
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=_work, args=(task, theirs), daemon=True)
+    process = context.Process(target=_work, args=(task, options, theirs), daemon=True)
     process.start()
     theirs.close()
     try:
@@ -308,11 +311,11 @@ def _worker(task: str) -> Iterator[Connection]:
             process.kill()
 
 
-def _work(task: str, connection: Connection) -> None:
+def _work(task: str, options: Mapping[str, Any], connection: Connection) -> None:
     """Body of a worker process: answers each duration with the steps per second it reached."""
     import hvs_suite
 
-    with hvs_suite.load(task) as env, contextlib.suppress(EOFError, KeyboardInterrupt):
+    with hvs_suite.load(task, **options) as env, contextlib.suppress(EOFError, KeyboardInterrupt):
         while True:
             steps, elapsed_s, _ = play(env, connection.recv())
             connection.send(steps / elapsed_s)

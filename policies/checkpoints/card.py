@@ -12,9 +12,11 @@ from typing import Any
 
 from hvs_suite.errors import PolicyError, first_line
 from hvs_suite.files import replacing
-from hvs_suite.policies.checkpoints.files import FILES, read_config
+from hvs_suite.policies.checkpoints.files import FILES, MOST_SETTINGS_BYTES, home, read_config
 from hvs_suite.policies.training.plot import PICTURE
+from hvs_suite.reading import check_regular, read_bytes
 from hvs_suite.registry import find
+from hvs_suite.tasks.shared.option_types import listed
 
 CARD = "README.md"
 LICENCE = "apache-2.0"
@@ -37,7 +39,7 @@ def write_card(folder: Path, results: Iterable[Mapping[str, Any]] = (), command:
         OutputError: It cannot be written.
     """
     config = read_config(folder)
-    trained, outcome = (_read(folder / name) for name in TRAINING_FILES[:2])
+    trained, outcome = (_read(folder, name) for name in TRAINING_FILES[:2])
     try:
         body = describe(config, trained, outcome, list(results), command)
         task = trained["settings"]["task"]
@@ -65,6 +67,8 @@ def ship(checkpoint: Path, folder: Path) -> None:
         if not (checkpoint / name).is_file():
             raise PolicyError(f"{checkpoint} lacks {name}; let its training come to its end first")
     read_config(checkpoint)
+    for name in TRAINING_FILES:
+        check_regular(checkpoint / name, error=PolicyError, within=home(checkpoint, name))
     for name in (*FILES, *TRAINING_FILES):
         with replacing(folder / name) as temporary:
             shutil.copyfile(checkpoint / name, temporary)
@@ -98,7 +102,7 @@ def describe(
     words = spec.describe()
     named = f"`{settings['task']}`"
     if options:
-        named += " with " + ", ".join(f"`{k}={v!r}`" for k, v in sorted(options.items()))
+        named += f" with `{listed(options)}`"
     rows = {
         "trained on": f"{named}, split `train` alone",
         "task": f"{spec.instruction()} Target: {words.target}; within {words.tolerance}",
@@ -198,8 +202,10 @@ def _results(results: list[Mapping[str, Any]]) -> list[str]:
         low, high = summary["pc_success_ci95"]
         steps = summary["steps_to_goal_mean"]
         settled = summary["settled"]["errors"][metric.name]["iqm"]
+        changed = listed(result["metadata"]["options"])
+        played = f"`{summary['task']}`" + (f" with `{changed}`" if changed else "")
         lines.append(
-            f"| `{summary['task']}` | `{summary['split']}` | {summary['n_success']:,} of "
+            f"| {played} | `{summary['split']}` | {summary['n_success']:,} of "
             f"{summary['n_episodes']:,} ({summary['pc_success']:.1f} %) | {low:.1f} to {high:.1f} "
             f"% | {summary['n_collision']} | {'-' if steps is None else f'{steps:.1f}'} | "
             f"{metric.title} {settled:.3f} {metric.unit} |"
@@ -214,10 +220,12 @@ def _front_matter(task: str) -> str:
     return "\n".join([*lines, "tags:", *(f"- {tag}" for tag in tags), "---", "", ""])
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(folder: Path, name: str) -> dict[str, Any]:
+    content = read_bytes(
+        folder / name, most=MOST_SETTINGS_BYTES, error=PolicyError, within=home(folder, name)
+    )
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError) as error:
-        raise PolicyError(
-            f"{path.parent} holds no finished training run: no readable {path.name}"
-        ) from error
+        # NaN stands for a loss that was not measured.
+        return dict(json.loads(content))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise PolicyError(f"{folder} holds no finished training run: no readable {name}") from error

@@ -104,7 +104,7 @@ def train_eyes(
             _train(network, pool, settings, [seed, number], on_share)
             seconds = {"train_s": time.perf_counter() - began}
             (place / "outcome.json").write_text(json.dumps(seconds), encoding="utf-8")
-            write_folded(best, network, improved)
+            write_folded(best, network, improved, spec)
         solved = success_of(improved, number + 1)
         if solved >= success:
             best, success = improved, solved

@@ -8,7 +8,6 @@ same command is given again.
 
 import contextlib
 import dataclasses
-import json
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping
@@ -47,7 +46,7 @@ from hvs_suite.policies.rl.run import Outcome, Progress, Run, check_run
 from hvs_suite.policies.training.budget import Budget
 from hvs_suite.policies.training.process import prepare_process
 from hvs_suite.policies.training.run_folder import claimed, write_train_config
-from hvs_suite.registry import find
+from hvs_suite.registry import find, options_of
 from hvs_suite.rollout import library_seeds, worker_conditions
 from hvs_suite.tasks.shared.spec import Spec
 
@@ -102,11 +101,11 @@ def finetune(
         OutputError: ``out`` cannot be written, or holds something else than this run.
     """
     settings = settings or Settings()
-    options = dict(options or {})
-    spec = find(task).with_options(options)
+    spec = find(task).with_options(options or {})
+    options = options_of(spec)
     limit = Budget(steps, minutes)
     check_run(seed, split, eval_every, eval_episodes)
-    levels = levels_of(task, curriculum) if curriculum is not None else [{}]
+    levels = levels_of(task, curriculum, options) if curriculum is not None else [{}]
     check_fit(read_config(policy), policy, spec)
     load_base(policy)
     prepare_process()
@@ -114,7 +113,7 @@ def finetune(
         "base": weights_digest(policy),
         "task": task,
         "task_version": spec.version,
-        "options": json.loads(json.dumps(options)),
+        "options": options,
         "curriculum": curriculum,
         "split": split,
         "seed": seed,
@@ -248,7 +247,7 @@ class _Finetuned:
         residual = self._network.residual
         assert residual is not None
         residual.load_state_dict(self.model.actor_target.mu.state_dict())
-        write_folded(self._base, self._network, self._candidate)
+        write_folded(self._base, self._network, self._candidate, self._variant)
         return CheckpointPolicy(self._candidate, self._variant)
 
     def keep(self) -> None:

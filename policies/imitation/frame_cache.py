@@ -17,8 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.datasets import reader
-from hvs_suite.errors import DatasetError, OutputError
+from hvs_suite.errors import DatasetError, OutputError, first_line
 from hvs_suite.files import replacing
+from hvs_suite.reading import check_regular, read_json
 
 Frames = npt.NDArray[np.uint8]
 OnFrames = Callable[[int], None]
@@ -64,10 +65,15 @@ def cached_frames(
     made_from = folder / f"{key}.json"
     stamp = {"dataset": fingerprint(root), "shape": [n_frames, *shape]}
     # A half-written cache has no stamp, because the stamp is written last.
-    with contextlib.suppress(OSError, ValueError):
-        if json.loads(made_from.read_text()) == stamp:
-            return open_frames(path)
-    made_from.unlink(missing_ok=True)
+    with contextlib.suppress(DatasetError):
+        if read_json(made_from, error=DatasetError, within=folder) == stamp:
+            kept = open_frames(path)
+            if [*kept.shape] == stamp["shape"] and kept.dtype == np.uint8:
+                return kept
+    try:
+        made_from.unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot replace {made_from}: {error.strerror}") from error
     frames: Any = new_frames(path, (n_frames, *shape))
     done = 0
     for stored in _stored(root, key):
@@ -108,13 +114,15 @@ def new_frames(path: Path, shape: Sequence[int]) -> Frames:
     """
     open_memmap: Any = np.lib.format.open_memmap  # untyped in NumPy's stubs
     try:
+        path.unlink(missing_ok=True)
         frames: Frames = open_memmap(path, mode="w+", dtype=np.uint8, shape=tuple(shape))
         # macOS has no such call.
         if hasattr(os, "posix_fallocate"):
             with path.open("r+b") as file:
                 os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
     except OSError as error:
-        path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            path.unlink()
         size = int(np.prod(shape, dtype=np.int64)) / 1e6
         raise OutputError(
             f"cannot write {path}: {error.strerror or error}; it takes {size:.1f} MB"
@@ -130,8 +138,15 @@ def open_frames(path: Path) -> Frames:
 
     Returns:
         (n, H, W, C) uint8.
+
+    Raises:
+        DatasetError: It is no such file.
     """
-    frames: Frames = np.load(path, mmap_mode="r", allow_pickle=False)
+    check_regular(path, error=DatasetError, within=path.parent)
+    try:
+        frames: Frames = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise DatasetError(f"{path} cannot be read ({first_line(error)})") from error
     mapping = _mapping(frames)
     if mapping is not None:
         # Rows are drawn at random. Where disks read some megabytes ahead, for each of them, the

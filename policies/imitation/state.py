@@ -12,8 +12,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from hvs_suite.errors import OutputError
+from hvs_suite.errors import OutputError, first_line
 from hvs_suite.files import replacing
+from hvs_suite.reading import check_regular
 
 WEIGHT = "weight."
 MOMENT = "moment."
@@ -69,6 +70,7 @@ def load_state(path: Path, model: nn.Module, optimizer: torch.optim.Optimizer) -
     """
     if not path.exists():
         return Counters()
+    check_regular(path, error=OutputError)
     weights: dict[str, Tensor] = {}
     moments: dict[int, dict[str, Tensor]] = {}
     try:
@@ -86,8 +88,8 @@ def load_state(path: Path, model: nn.Module, optimizer: torch.optim.Optimizer) -
         optimizer.load_state_dict(
             {"state": moments, "param_groups": optimizer.state_dict()["param_groups"]}
         )
-    except (SafetensorError, OSError, KeyError, ValueError, RuntimeError) as error:
+    except (SafetensorError, OSError, LookupError, TypeError, ValueError, RuntimeError) as error:
         raise OutputError(
-            f"{path} cannot be resumed ({str(error).splitlines()[0]}); name another --out"
+            f"{path} cannot be resumed ({first_line(error)}); name another --out"
         ) from error
     return counters

@@ -25,7 +25,7 @@ from hvs_suite.policies.sac.settings import Settings
 from hvs_suite.policies.training.budget import Budget
 from hvs_suite.policies.training.process import prepare_process
 from hvs_suite.policies.training.run_folder import claimed, write_train_config
-from hvs_suite.registry import find
+from hvs_suite.registry import find, options_of
 from hvs_suite.rollout import library_seeds
 from hvs_suite.tasks.shared.spec import (
     PRESETS,
@@ -84,8 +84,8 @@ def train_sac(
         OutputError: ``out`` cannot be written, or holds something else than this run.
     """
     settings = settings or Settings()
-    options = {**(options or {}), "rewards": tuple(rewards)}
-    spec = find(task).with_options(options)
+    spec = find(task).with_options({**(options or {}), "rewards": tuple(rewards)})
+    options = options_of(spec)
     limit = Budget(steps, minutes)
     check_run(seed, split, eval_every, eval_episodes)
     _check(spec, device)
@@ -93,7 +93,7 @@ def train_sac(
     identity = {
         "task": task,
         "task_version": spec.version,
-        "options": json.loads(json.dumps(options)),
+        "options": options,
         "split": split,
         "seed": seed,
         **json.loads(json.dumps(dataclasses.asdict(settings))),

@@ -9,6 +9,7 @@ from typing import Any
 
 from hvs_suite.errors import OutputError
 from hvs_suite.files import check_writable, only_writer, replacing
+from hvs_suite.reading import read_object
 
 CONFIG = "train_config.json"
 
@@ -35,14 +36,13 @@ def claimed(out: Path, settings: Mapping[str, Any]) -> Iterator[None]:
 def _check_same_run(out: Path, settings: Mapping[str, Any]) -> None:
     """Refuse a folder that holds something else than an interrupted run with these settings."""
     config = out / CONFIG
-    try:
-        begun = json.loads(config.read_text())["settings"]
-    except OSError:
+    if not config.exists():
         if any(out.iterdir()):
-            raise OutputError(f"{out} is not empty; name another --out") from None
+            raise OutputError(f"{out} is not empty; name another --out")
         return
-    except (ValueError, KeyError, TypeError):
-        raise OutputError(f"{config} is damaged; name another --out") from None
+    begun = read_object(config, error=OutputError).get("settings")
+    if not isinstance(begun, dict):
+        raise OutputError(f"{config} is damaged; name another --out")
     wanted = json.loads(json.dumps(settings))
     differing = sorted(name for name in wanted if begun.get(name) != wanted[name])
     if differing:

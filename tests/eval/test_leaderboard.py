@@ -382,7 +382,7 @@ def another_split(results: Path) -> str:
 
 def changed_task(results: Path) -> str:
     alter(results / "zero" / "align-fixed.json", options={"hold_steps": 2})
-    return r"task was changed \(hold_steps\)"
+    return r"task was changed \(hold_steps=2\)"
 
 
 def duplicate(results: Path) -> str:

@@ -458,7 +458,7 @@ TAMPERING: dict[str, tuple[Callable[[Content, Path], None], str]] = {
     "an easier task": (resealed("summary.task", "align-easy"), "task_digest is"),
     "another split": (resealed("summary.split", "train"), "scenario 0: "),
     "another version of MuJoCo": (edit("metadata.packages", {}), "was changed after it was"),
-    "an option": (resealed("metadata.options", {"hold_steps": 1}), "the task was changed"),
+    "an option": (resealed("metadata.options", {"hold_steps": 1}), "not what differs"),
     "another schema": (lambda content, path: content.update(schema_version=1), "schema_version"),
 }
 

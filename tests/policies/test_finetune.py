@@ -117,7 +117,7 @@ def sent(folder):
 def test_a_residual_adds_nothing_at_first_and_no_more_than_its_bound_ever(base, tmp_path):
     plain = load_base(base)
     network = with_residual(plain, hidden=16, bound=0.6)
-    write_folded(base, network, tmp_path / "folded")
+    write_folded(base, network, tmp_path / "folded", hvs_suite.TASKS["align-easy"])
     np.testing.assert_allclose(sent(tmp_path / "folded"), sent(base), atol=1e-6)
     with torch.no_grad():
         network.residual[-2].bias.fill_(100.0)
@@ -438,3 +438,9 @@ def test_what_cannot_be_fine_tuned_is_refused(whole, base, tmp_path, capsys):
     assert run(["finetune", *words]) == 2
     assert "does not fit align-easy" in capsys.readouterr().err
     assert not (tmp_path / "cli").exists()
+
+
+def test_the_options_of_the_run_are_in_checkpoint_and_notes(whole):
+    out, _, _ = whole
+    assert json.loads((out / "config.json").read_text())["options"] == OPTIONS
+    assert json.loads((out / "train_config.json").read_text())["settings"]["options"] == OPTIONS

@@ -65,6 +65,24 @@ def test_the_hub_gets_every_file_and_nobody_sees_the_token(checkpoint, tmp_path)
 
 
 @pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda path: path.write_text("null"),
+        lambda path: path.write_text("[" * 100_000),
+        lambda path: (path.unlink(), path.symlink_to("/etc/hostname")),
+        lambda path: (path.unlink(), path.symlink_to("/dev/zero")),
+    ],
+    ids=["null", "deep", "link out", "device"],
+)
+def test_notes_of_a_strange_run_are_refused_in_one_line(checkpoint, tmp_path, capsys, spoil):
+    strange = tmp_path / "strange"
+    shutil.copytree(checkpoint, strange)
+    spoil(strange / "training" / "outcome.json")
+    assert run(["ship", str(strange), "--to-folder", str(tmp_path / "out")]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
     ("words", "reason"),
     [
         (["{policy}"], "--to-folder"),
