@@ -92,8 +92,7 @@ def record(
         UnknownTaskError: There is no such task.
         OptionError: An option or a number makes no sense.
         ScenarioError: The split holds fewer scenarios.
-        OutputError: ``out`` is not empty without ``resume``, cannot be written, or another process
-            records into it.
+        OutputError: ``out`` is not empty without ``resume``, cannot be written, or is in use.
         DatasetError: What ``resume`` found was recorded otherwise.
     """
     spec = find(task).with_options(dict(options or {}))

@@ -113,12 +113,16 @@ def evaluate(
         trials = [kept.trials[index] for index in range(episodes)]
         result, log = evaluation.result(trials, _timings(trials, wall_s, workers))
         if out is not None:
-            # The log first: a result never stands there without the log that it speaks of.
-            with files.replacing(result_file.actions_path(out)) as temporary:
-                temporary.write_bytes(log)
-            result_file.write(result, out)
+            _write(result, log, out)
         kept.remove()
     return result
+
+
+def _write(result: result_file.Result, log: bytes, out: Path) -> None:
+    # The log first: a result never stands there without the log that it speaks of.
+    with files.replacing(result_file.actions_path(out)) as temporary:
+        temporary.write_bytes(log)
+    result_file.write(result, out)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,7 +11,6 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +19,7 @@ from torch import Tensor
 from hvs_suite.datasets.features import dataset_features
 from hvs_suite.policies.finetune.folding import load_base, write_folded
 from hvs_suite.policies.finetune.settings import Settings
+from hvs_suite.policies.finetune.stage import MakeStage
 from hvs_suite.policies.hvs.dataset import GOAL_NORMAL, GOAL_POSITION, TARGET_PREFIX, Manifest
 from hvs_suite.policies.hvs.network import (
     IMAGE_PREFIX,
@@ -44,13 +44,9 @@ ORDER_STREAM = 4
 
 
 def train_eyes(
-    base: Path,
+    run: MakeStage,
     folder: Path,
     spec: Spec,
-    options: Mapping[str, Any],
-    split: str,
-    seed: int,
-    settings: Settings,
     evaluate: Callable[[Path, int, int], Evaluation],
     on_share: Callable[[str, float], None],
 ) -> Path:
@@ -60,21 +56,18 @@ def train_eyes(
     scenes are solved than before are not kept.
 
     Args:
-        base: Checkpoint to begin with.
+        run: Whose base to begin with, and whose task, stream of scenes, seed and settings to take.
         folder: Gets a folder a round: its frames, the checkpoint that came of it, and
             ``outcome.json`` with the seconds of the sitting that finished it; and
             ``evaluations.json``, of the base and of each round.
-        spec: The named task.
-        options: Task options that differ from it.
-        split: Stream of scenes.
-        seed: Of the run.
-        settings: How many rounds, frames and steps.
+        spec: The task.
         evaluate: Evaluates a checkpoint, given the frames played and the optimiser steps so far.
         on_share: Called with ``looking`` or ``training eyes``, and the share of it that is done.
 
     Returns:
         The checkpoint that solved most; of equals the last, and the base if there are no rounds.
     """
+    base, seed, settings = run.base, run.seed, run.settings
     results = folder / "evaluations.json"
     evaluations = read_evaluations(results, sys.maxsize)
 
@@ -88,7 +81,7 @@ def train_eyes(
     if not settings.eye_rounds:
         return base
     folder.mkdir(parents=True, exist_ok=True)
-    manifest = Manifest(folder, spec.name, split, options, dataset_features(spec), 0, 0)
+    manifest = Manifest(folder, spec.name, run.split, run.options, dataset_features(spec), 0, 0)
     pool = FramePool(manifest, seed, load_base(base).calibration)
     scene = seed * SCENES_A_SEED + FIRST_SCENE
     best, success = base, success_of(base, 0)

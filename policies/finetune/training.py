@@ -14,10 +14,8 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
-from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
 
 from hvs_suite.policies.catalogue import name_of
@@ -37,11 +35,10 @@ from hvs_suite.policies.finetune.overlapped import (
 )
 from hvs_suite.policies.finetune.residual_td3 import ResidualPolicy, ResidualTD3
 from hvs_suite.policies.finetune.settings import Settings
-from hvs_suite.policies.finetune.stage import ResidualStage
+from hvs_suite.policies.finetune.stage import MakeStage
 from hvs_suite.policies.hvs.network import N_JOINTS, HvsNetwork
-from hvs_suite.policies.rl.curriculum import Curriculum, Kind, levels_of
+from hvs_suite.policies.rl.curriculum import Kind, levels_of
 from hvs_suite.policies.rl.evaluation import Evaluation, Evaluator
-from hvs_suite.policies.rl.journal import OUTCOMES, Journal
 from hvs_suite.policies.rl.run import Outcome, Progress, Run, check_run
 from hvs_suite.policies.training.budget import Budget
 from hvs_suite.policies.training.process import prepare_process
@@ -136,7 +133,7 @@ def finetune(
 
 
 def _with_new_eyes(
-    make: "MakeStage",
+    make: MakeStage,
     folder: Path,
     spec: Spec,
     evaluator: Evaluator,
@@ -156,21 +153,11 @@ def _with_new_eyes(
             on_episode=lambda done: on_share("evaluating", done / evaluator.episodes),
         )
 
-    return train_eyes(
-        make.base,
-        folder,
-        spec,
-        make.options,
-        make.split,
-        make.seed,
-        make.settings,
-        evaluate,
-        on_share,
-    )
+    return train_eyes(make, folder, spec, evaluate, on_share)
 
 
 @contextlib.contextmanager
-def _learner(make: "MakeStage", out: Path, spec: Spec) -> Iterator["_Finetuned"]:
+def _learner(make: MakeStage, out: Path, spec: Spec) -> Iterator["_Finetuned"]:
     """The model on its environments, which are closed in the end."""
     if make.settings.environments > 1:
         # They and the learner play and learn at the same time.
@@ -178,45 +165,6 @@ def _learner(make: "MakeStage", out: Path, spec: Spec) -> Iterator["_Finetuned"]
     with contextlib.closing(_environments(make)) as environments:
         model = _make_model(environments, load_base(make.base), make.settings, make.seed)
         yield _Finetuned(model, make.base, out, spec)
-
-
-@dataclasses.dataclass(frozen=True)
-class MakeStage:
-    """Makes one of a run's environments; travels to its worker.
-
-    Attributes:
-        task: Named task.
-        options: Task options that differ from it.
-        levels: Further options, of each level of the curriculum.
-        split: Stream of scenes.
-        base: Checkpoint that plays.
-        settings: Of the run.
-        seed: Of the run.
-        part: Which of the environments it is.
-    """
-
-    task: str
-    options: Mapping[str, Any]
-    levels: list[dict[str, Any]]
-    split: str
-    base: Path
-    settings: Settings
-    seed: int
-    part: int = 0
-
-    def __call__(self) -> gymnasium.Env[Any, Any]:
-        """Make it."""
-        settings = self.settings
-        env = Curriculum(self.task, self.levels, split=self.split, **self.options)
-        # The monitor inside: it sees the task's own rewards.
-        stage = ResidualStage(
-            Monitor(env, info_keywords=OUTCOMES),
-            self.base,
-            settings.bound,
-            settings.shaping,
-            settings.gamma,
-        )
-        return Journal(stage, self.seed, self.part, settings.environments, settings.lost_share)
 
 
 def _environments(make: MakeStage) -> Overlapped:

@@ -180,11 +180,7 @@ def pretrain(
             ),
             checkpoint_period_s=checkpoint_period_s,
         )
-        outcome = run.outcome(policy)
-        with replacing(training / "outcome.json") as temporary:
-            temporary.write_text(json.dumps(dataclasses.asdict(outcome), indent=2) + "\n")
-        draw_run(out)
-        return outcome
+        return run.finish(policy)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -338,9 +334,9 @@ class _Run:
         optimizer.step()
         return loss.item(), parts
 
-    def outcome(self, policy: "HvsPolicy") -> Outcome:
-        """What the sitting came to."""
-        return Outcome(
+    def finish(self, policy: "HvsPolicy") -> Outcome:
+        """What the sitting came to, written and drawn."""
+        outcome = Outcome(
             step=self._counters.step,
             train_s=self._counters.elapsed_s,
             decode_s=self._decode_s,
@@ -352,6 +348,10 @@ class _Run:
             held_out_loss=self._held_out_loss,
             n_parameters=sum(p.numel() for p in policy.parameters()),
         )
+        with replacing(self._out / "training" / "outcome.json") as temporary:
+            temporary.write_text(json.dumps(dataclasses.asdict(outcome), indent=2) + "\n")
+        draw_run(self._out)
+        return outcome
 
     def _reopen(self, demonstrations: Demonstrations, folder: Path) -> bool:
         """Learn from a round if it was played."""
