@@ -18,7 +18,6 @@ from hvs_suite.eval.board.tables import (
 )
 from hvs_suite.eval.scoring.result_file import Metadata
 from hvs_suite.names import shown
-from hvs_suite.tasks.shared.goal import LATERAL, POSITION
 from hvs_suite.tasks.shared.metric import Metric
 
 
@@ -130,9 +129,8 @@ def sideways(entry: Entry) -> float | None:
     They do where episodes are played to their end whatever comes: past the goal to the time limit.
     """
     spec = registry.find(entry.result.summary.task)
-    if not spec.plays_on:
-        return None
-    return spec.step_bounds.get(LATERAL, spec.step_bounds.get(POSITION))
+    metric = spec.landing_metric
+    return metric.bound if metric is not None and spec.plays_on else None
 
 
 def metrics_of(entry: Entry) -> list[Metric]:

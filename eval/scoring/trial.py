@@ -21,6 +21,7 @@ import dm_env
 import numpy as np
 import numpy.typing as npt
 
+from hvs_suite import registry, rollout
 from hvs_suite.errors import OptionError, describe
 from hvs_suite.eval.scoring.result_file import EpisodeRow, Settled
 from hvs_suite.rollout import Action, Observation, Policy, library_seeds
@@ -132,6 +133,30 @@ def outcome(row: EpisodeRow) -> dict[str, Any]:
         "settled.collision": end.collision,
         "settled.failure": end.failure,
     }
+
+
+@dataclasses.dataclass(frozen=True)
+class MakeTask:
+    """Builds a task in whichever process asks for it.
+
+    Attributes:
+        task: Named task.
+        split: Split its scenarios come from.
+        options: Options that differ from it.
+        pictures: Draw the observations; a re-simulation needs none.
+    """
+
+    task: str
+    split: str
+    options: Mapping[str, Any]
+    pictures: bool = True
+
+    def __call__(self) -> rollout.Environment:
+        """Returns a new environment."""
+        unseen = {} if self.pictures else {"observations": "state"}
+        options = {**self.options, **unseen}
+        env: rollout.Environment = registry.load(self.task, split=self.split, **options)
+        return env
 
 
 @dataclasses.dataclass(frozen=True)

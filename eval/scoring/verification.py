@@ -20,9 +20,15 @@ import numpy as np
 from hvs_suite import registry, rollout
 from hvs_suite.errors import OptionError, ResultError
 from hvs_suite.eval.scoring import action_log, contender, result_file
-from hvs_suite.eval.scoring.protocol import MakeTask
 from hvs_suite.eval.scoring.result_file import EpisodeRow, Result
-from hvs_suite.eval.scoring.trial import EpisodeLostError, Stage, outcome, play_trial, same_outcome
+from hvs_suite.eval.scoring.trial import (
+    EpisodeLostError,
+    MakeTask,
+    Stage,
+    outcome,
+    play_trial,
+    same_outcome,
+)
 from hvs_suite.names import shown
 from hvs_suite.policies import builtin, catalogue
 from hvs_suite.rollout import Action, Observation

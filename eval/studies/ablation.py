@@ -6,7 +6,6 @@ done again.
 """
 
 import dataclasses
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -17,8 +16,8 @@ import pydantic
 from hvs_suite.errors import OptionError
 from hvs_suite.eval.scoring.comparison import Tally
 from hvs_suite.eval.scoring.result_file import Result
-from hvs_suite.eval.studies.training import SPLIT, Report, earlier_result, train_and_judge
-from hvs_suite.policies.imitation.demonstrations import read_manifest
+from hvs_suite.eval.studies.training import SPLIT, Note, Report, train_and_judge
+from hvs_suite.policies.hvs.dataset import read_manifest
 from hvs_suite.registry import find
 
 WHOLE = "everything"
@@ -184,21 +183,21 @@ def _judged(
         "episodes": demonstrations if ablation.data_share < 1.0 else None,
         **ablation.options,
     }
-    result = earlier_result(folder, budget.episodes)
-    if result is None:
-        result = train_and_judge(
-            name,
-            data,
-            manifest.task,
-            folder,
-            report,
-            scenarios=budget.episodes,
-            workers=budget.workers,
-            **options,
-        )
-        # Gigabytes of frames that nobody asks for again.
-        for kept in ("cache", "dagger"):
-            shutil.rmtree(folder / "policy" / "training" / kept, ignore_errors=True)
+
+    def train(policy: Path, note: Note) -> None:
+        from hvs_suite.policies.imitation.pretrain import pretrain
+
+        pretrain(data, policy, workers=budget.workers, on_progress=note, **options)
+
+    result = train_and_judge(
+        name,
+        manifest.task,
+        folder,
+        train,
+        report,
+        scenarios=budget.episodes,
+        workers=budget.workers,
+    )
     return result, demonstrations, result.metadata.training_hours or 0.0
 
 

@@ -35,9 +35,9 @@ from hvs_suite.eval.studies.compression_figures import (
     Success,
     located,
 )
-from hvs_suite.eval.studies.training import Report, earlier_result, train_and_judge
+from hvs_suite.eval.studies.training import Note, Report, train_and_judge
 from hvs_suite.files import check_writable, replacing
-from hvs_suite.policies.imitation.demonstrations import read_manifest, refuse_test_split
+from hvs_suite.policies.hvs.dataset import read_manifest, refuse_test_split
 from hvs_suite.policies.imitation.frame_cache import fingerprint
 from hvs_suite.registry import find
 
@@ -319,27 +319,35 @@ def _trained(
     """Result of a policy that learned from a setting's pictures; None are the lossless ones."""
     # Another training is another experiment and lies beside the first.
     run = folder / f"steps-{training.steps}-seed-{training.seed}"
-    if (earlier := earlier_result(run, training.episodes)) is not None:
-        return earlier
-    data = original.root
-    if encoding is not None:
-        data = folder / "frames"
-        if not data.exists():
-            _write_decoded(original, folder, encoding, data, report)
+
+    def train(policy: Path, note: Note) -> None:
+        from hvs_suite.policies.imitation.pretrain import pretrain
+
+        data = original.root
+        if encoding is not None:
+            data = folder / "frames"
+            if not data.exists():
+                _write_decoded(original, folder, encoding, data, report)
+        pretrain(
+            data,
+            policy,
+            steps=training.steps,
+            seed=training.seed,
+            workers=training.workers,
+            on_progress=note,
+        )
+
     result = train_and_judge(
         _words(encoding),
-        data,
         original.task,
         run,
+        train,
         report,
         scenarios=training.episodes,
         workers=training.workers,
-        steps=training.steps,
-        seed=training.seed,
     )
     # Decoded frames are larger than the dataset; a dozen settings of them would fill the disk.
     shutil.rmtree(folder / "frames", ignore_errors=True)
-    shutil.rmtree(run / "policy" / "training" / "cache", ignore_errors=True)
     return result
 
 

@@ -9,11 +9,9 @@ no base. All lie in one folder; what is finished there is not done again.
 import contextlib
 import dataclasses
 import json
-import math
 import multiprocessing
 import os
 import queue
-import shutil
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -25,9 +23,9 @@ import pydantic
 from hvs_suite.errors import OptionError, OutputError
 from hvs_suite.eval.scoring.comparison import Tally
 from hvs_suite.eval.scoring.result_file import Result
-from hvs_suite.eval.studies.training import Report, earlier_result, judge
+from hvs_suite.eval.studies.training import Note, Report, train_and_judge
 from hvs_suite.files import replacing
-from hvs_suite.policies.imitation.demonstrations import read_manifest
+from hvs_suite.policies.hvs.dataset import read_manifest
 from hvs_suite.rollout import worker_conditions
 
 BASE = "base"
@@ -44,10 +42,6 @@ WEAK_BASE: Mapping[str, Any] = {
 """What fine-tuning does otherwise than by default: a base that is far too slow must be changed by
 more than one that is good already (docs/experiments/few-demonstrations.md)."""
 STUDY_FILE = "study.json"
-GIGABYTES = ("cache", "dagger", "replay", "eyes/*/frames")
-"""Folders of a training that nobody asks for again, as patterns."""
-
-Note = Callable[[Any], None]
 
 
 class Point(pydantic.BaseModel):
@@ -477,26 +471,9 @@ class _Maker:
         run, budget = self._folder(way, count, seed), self.budget
         training = run / "policy" / "training"
         name = f"{way}, {count} demonstrations, seed {seed}" if count else f"{way}, seed {seed}"
-        result = earlier_result(run, budget.episodes)
-        if result is None:
-
-            def note(state: Any) -> None:
-                left = "" if math.isnan(state.seconds_left) else f"{state.seconds_left:.0f} s left"
-                self.report(f"{name}, {state.stage}", state.share, left)
-
-            train(run / "policy", note)
-            result = judge(
-                name,
-                run / "policy",
-                self.task,
-                run,
-                self.report,
-                scenarios=budget.episodes,
-                workers=1,
-            )
-            for pattern in GIGABYTES:
-                for folder in training.glob(pattern):
-                    shutil.rmtree(folder, ignore_errors=True)
+        result = train_and_judge(
+            name, self.task, run, train, self.report, scenarios=budget.episodes, workers=1
+        )
         return training, result
 
 

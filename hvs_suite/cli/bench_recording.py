@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hvs_suite.cli import console
-from hvs_suite.cli.bench import two_worker_rate
+from hvs_suite.cli.bench_simulation import two_worker_rate
 
 WORKERS = 2
 

@@ -89,7 +89,7 @@ class Evaluate:
     def _evaluate(
         self, task: str, path: Path, contender: "Contender", options: Mapping[str, Any]
     ) -> "Result":
-        from hvs_suite.eval.scoring import protocol
+        from hvs_suite.eval import protocol
 
         n_played = n_success = n_failure = 0
         with console.progress(f"{contender.name} on {task}", self.episodes) as advance:

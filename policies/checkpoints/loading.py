@@ -30,7 +30,6 @@ from hvs_suite.policies.checkpoints.files import (
     read_settings,
     read_steps,
 )
-from hvs_suite.policies.checkpoints.trained_for import check_trained_for
 from hvs_suite.policies.hvs.compiled import CompiledNetwork
 from hvs_suite.policies.hvs.network import (
     IMAGE_PREFIX,
@@ -40,6 +39,7 @@ from hvs_suite.policies.hvs.network import (
     HvsNetwork,
     shape_from_config,
 )
+from hvs_suite.policies.trained_for import check_trained_for
 from hvs_suite.rollout import Observation, one_torch_thread
 from hvs_suite.tasks.shared.spec import Spec, observation_names
 

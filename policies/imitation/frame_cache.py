@@ -26,28 +26,10 @@ OnFrames = Callable[[int], None]
 ROWS_AT_ONCE = 256
 
 
-def data_files(root: Path) -> list[Path]:
-    """Tabular files of a dataset, in frame order.
-
-    Args:
-        root: The dataset.
-
-    Returns:
-        The files.
-
-    Raises:
-        DatasetError: There are none.
-    """
-    files = sorted((root / "data").glob("chunk-*/file-*.parquet"))
-    if not files:
-        raise DatasetError(f"{root} holds no data/chunk-*/file-*.parquet; record it first")
-    return files
-
-
 def fingerprint(root: Path) -> str:
     """Short digest of a dataset's files by name, size and time of change."""
     parts = []
-    for path in [root / "meta" / "info.json", *data_files(root)]:
+    for path in [root / "meta" / "info.json", *reader.data_files(root)]:
         stat = path.stat()
         parts.append(f"{path.relative_to(root)} {stat.st_size} {stat.st_mtime_ns}")
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
@@ -202,7 +184,7 @@ def read_rows(frames: Frames, rows: npt.NDArray[np.int64], out: Frames) -> None:
 
 def _stored(root: Path, key: str) -> Iterator[Any]:
     """The images of a camera as parquet holds them."""
-    for path in data_files(root):
+    for path in reader.data_files(root):
         table = reader.read_table(root, path.relative_to(root).as_posix(), [key])
         for stored in table.column(key):
             yield stored.as_py()

@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,25 +19,20 @@ import torch
 
 from hvs_suite.errors import OptionError, PolicyError
 from hvs_suite.files import replacing
-from hvs_suite.policies.checkpoints.loading import weights_digest
+from hvs_suite.policies.hvs.dataset import Manifest, read_manifest, refuse_test_split
 from hvs_suite.policies.imitation.dagger import RoundSummary, play_round, read_round, round_shares
-from hvs_suite.policies.imitation.demonstrations import (
-    Demonstrations,
-    Manifest,
-    read_manifest,
-    refuse_test_split,
-)
-from hvs_suite.policies.imitation.frame_cache import fingerprint
+from hvs_suite.policies.imitation.demonstrations import Demonstrations
 from hvs_suite.policies.imitation.settings import (
     Settings,
     new_policy,
+    settings_for,
     take_eyes,
-    tightest_scale,
 )
 from hvs_suite.policies.imitation.state import Counters, load_state, save_state
-from hvs_suite.policies.training.allocator import keep_freed_memory
+from hvs_suite.policies.training.budget import Budget
 from hvs_suite.policies.training.curves import Curves
 from hvs_suite.policies.training.plot import draw_run
+from hvs_suite.policies.training.process import prepare_process
 from hvs_suite.policies.training.run_folder import claimed, write_train_config
 
 if TYPE_CHECKING:
@@ -114,20 +109,11 @@ def pretrain(
     *,
     minutes: float | None = None,
     steps: int | None = None,
-    seed: int = 0,
-    batch_size: int = 64,
-    learning_rate: float = 2e-3,
-    dagger_rounds: int = 0,
-    dagger_frames: int = 6000,
-    inputs: tuple[str, ...] | None = None,
-    episodes: int | None = None,
-    rehearsal_frames: int = 512,
-    keypoint_weight: float = 1.0,
-    error_scale: float | None = None,
     eyes: Path | None = None,
     workers: int = 2,
     checkpoint_period_s: float = 60.0,
     on_progress: Callable[[Progress], None] | None = None,
+    **settings: Any,
 ) -> Outcome:
     """Train the `hvs` policy on a dataset, or go on with a run that was interrupted.
 
@@ -135,24 +121,13 @@ def pretrain(
         data: Root of the dataset; its ``hvs.json`` names the task.
         out: Folder for the checkpoint, which loads with ``from_pretrained``; the training state
             lives in ``out/training``.
-        minutes: Stop after this much training, decoding not counted (min).
+        minutes: Stop after this much training, decoding and DAgger rounds not counted (min).
         steps: Stop after this many optimiser steps. Give either, or both for the first reached.
-        seed: Of initial weights, held-out episodes and order.
-        batch_size: Frames a step.
-        learning_rate: Peak of the schedule (a short warm-up, then a cosine to zero).
-        dagger_rounds: How often to let the policy play, the expert labelling every step, and to add
-            those frames. The budget counts training only.
-        dagger_frames: Frames a round.
-        inputs: What the policy is given, of ``eih``, ``eth`` and ``joints``; None for all.
-        episodes: Learn from the first so many demonstrations alone; None from all.
-        rehearsal_frames: Frames a step that the head alone learns from, without their images; see
-            `hvs_suite.policies.hvs.rehearsal`.
-        keypoint_weight: Weight of the supervision by ``privileged.*``; 0 trains on actions alone.
-        error_scale: See `HvsConfig`; None for five times the task's tightest tolerance.
         eyes: Checkpoint of a policy to take the eyes of, see `take_eyes`; None for fresh ones.
         workers: Processes that play the rounds; any number gives the same.
         checkpoint_period_s: Time between checkpoints (s).
         on_progress: Called while decoding and after every step.
+        **settings: Fields of `Settings` that differ from the defaults.
 
     Returns:
         What the run came to.
@@ -164,39 +139,24 @@ def pretrain(
             this run. With room again, the same command goes on from the last checkpoint.
         PolicyError: The eyes do not fit, or the loss is no number any more.
     """
-    _check_budget(minutes, steps)
+    budget = Budget(steps, minutes)
     if workers < 1:
         raise OptionError(f"workers must be at least 1, not {workers}")
     manifest = read_manifest(data)
     refuse_test_split(manifest)
-    settings = Settings(
-        seed=seed,
-        batch_size=batch_size,
-        learning_rate=learning_rate,
-        dagger_rounds=dagger_rounds,
-        dagger_frames=dagger_frames,
-        dataset=fingerprint(data),
-        task=manifest.task,
-        inputs=inputs,
-        episodes=episodes,
-        rehearsal_frames=rehearsal_frames,
-        keypoint_weight=keypoint_weight,
-        error_scale=tightest_scale(manifest) if error_scale is None else error_scale,
-        eyes=None if eyes is None else weights_digest(eyes),
-    )
-    settings.check(manifest)
-    if inputs is not None:
-        manifest = manifest.with_inputs(inputs)
-    keep_freed_memory()
-    torch.set_num_threads(min(2, torch.get_num_threads()))
-    with claimed(out, dataclasses.asdict(settings)):
+    chosen = settings_for(manifest, eyes, settings)
+    if chosen.inputs is not None:
+        manifest = manifest.with_inputs(chosen.inputs)
+    prepare_process()
+    identity = dataclasses.asdict(chosen)
+    with claimed(out, identity):
         training = out / "training"
-        policy = new_policy(manifest, settings)
+        policy = new_policy(manifest, chosen)
         if eyes is not None:
             take_eyes(policy, eyes)
         write_train_config(
             out,
-            dataclasses.asdict(settings),
+            identity,
             {"minutes": minutes, "steps": steps},
             PACKAGES,
             data=str(data),
@@ -209,37 +169,18 @@ def pretrain(
             },
         )
         run = _Run(out, on_progress)
-        demonstrations = run.decode(manifest, training / "cache", settings)
+        demonstrations = run.decode(manifest, training / "cache", chosen)
         run.train(
             policy,
             demonstrations,
-            settings,
-            budget=_Budget(steps, None if minutes is None else 60.0 * minutes),
-            rounds=_Rounds(training / "dagger", dagger_rounds, dagger_frames, workers),
+            chosen,
+            budget=budget,
+            rounds=_Rounds(
+                training / "dagger", chosen.dagger_rounds, chosen.dagger_frames, workers
+            ),
             checkpoint_period_s=checkpoint_period_s,
         )
-        outcome = run.outcome(policy)
-        with replacing(training / "outcome.json") as temporary:
-            temporary.write_text(json.dumps(dataclasses.asdict(outcome), indent=2) + "\n")
-        draw_run(out)
-        return outcome
-
-
-@dataclasses.dataclass(frozen=True)
-class _Budget:
-    """How long to train: steps, seconds, or whichever is reached first."""
-
-    steps: int | None
-    seconds: float | None
-
-    def share(self, counters: Counters) -> float:
-        """Part that is used up, 1 at the end."""
-        shares = [0.0]
-        if self.steps is not None:
-            shares.append(counters.step / self.steps)
-        if self.seconds is not None:
-            shares.append(counters.elapsed_s / self.seconds)
-        return max(shares)
+        return run.finish(policy)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -292,7 +233,7 @@ class _Run:
         demonstrations: Demonstrations,
         settings: Settings,
         *,
-        budget: _Budget,
+        budget: Budget,
         rounds: _Rounds,
         checkpoint_period_s: float,
     ) -> None:
@@ -308,13 +249,13 @@ class _Run:
                 break
         order = _Order(demonstrations.training, batch_size, settings.seed)
         before_s = self._counters.elapsed_s
-        begun = budget.share(self._counters)
+        begun = self._share(budget)
         started = last_checkpoint = time.perf_counter()
         recent: list[float] = []
         policy.train()
         curves = Curves(self._out / "training" / "tensorboard", self._counters.step)
         try:
-            while (share := budget.share(self._counters)) < 1.0:
+            while (share := self._share(budget)) < 1.0:
                 if len(self._rounds) < len(due) and share >= due[len(self._rounds)]:
                     paused = time.perf_counter()
                     self._checkpoint(policy, optimizer, demonstrations, state, curves)
@@ -324,30 +265,15 @@ class _Run:
                     started, last_checkpoint = started + pause, time.perf_counter()
                     self._play_s += pause
                 step = self._counters.step
+                step_rate = rate * _schedule(share)
                 for group in optimizer.param_groups:
-                    group["lr"] = rate * _schedule(share)
+                    group["lr"] = step_rate
                 fetched = time.perf_counter()
                 batch = demonstrations.batch(order.indices(step))
                 self._data_s += time.perf_counter() - fetched
-                lesson = policy.supervise(batch)
-                loss, parts = lesson.loss, lesson.parts
-                if settings.rehearsal_frames:
-                    extra = _rehearse(policy, demonstrations, lesson, settings, step)
-                    parts["rehearsal_loss"] = extra.item()
-                    loss = loss + extra
-                optimizer.zero_grad()
-                loss.backward()  # type: ignore[no-untyped-call]
-                norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), GRADIENT_NORM)
-                # Before the step: a weight that is no number would spread through all the others.
-                if not math.isfinite(loss.item()) or not math.isfinite(norm.item()):
-                    raise PolicyError(
-                        f"training came apart at step {step + 1} (loss {loss.item()}, gradient "
-                        f"{norm.item()}); {self._out} keeps its last checkpoint; train anew on "
-                        "other data, or with a lower learning rate"
-                    )
-                optimizer.step()
+                loss, parts = self._step(policy, optimizer, batch, demonstrations, settings)
 
-                recent = [*recent[1 - LOG_EVERY_STEPS :], loss.item()]
+                recent = [*recent[1 - LOG_EVERY_STEPS :], loss]
                 self._loss = sum(recent) / len(recent)
                 self._frames += batch_size
                 now = time.perf_counter()
@@ -356,21 +282,61 @@ class _Run:
                 if self._counters.step % LOG_EVERY_STEPS == 0:
                     figures = {"loss": self._loss, **parts}
                     curves.add(
-                        {"learning_rate": group["lr"]}
+                        {"learning_rate": step_rate}
                         | {f"train/{name}": value for name, value in figures.items()},
                         self._counters.step,
                     )
                 if now - last_checkpoint >= checkpoint_period_s:
                     self._checkpoint(policy, optimizer, demonstrations, state, curves)
                     last_checkpoint = time.perf_counter()
-                self._report_training(budget.share(self._counters), begun)
+                self._report_training(self._share(budget), begun)
             self._checkpoint(policy, optimizer, demonstrations, state, curves)
         finally:
             curves.close()
 
-    def outcome(self, policy: "HvsPolicy") -> Outcome:
-        """What the sitting came to."""
-        return Outcome(
+    def _share(self, budget: Budget) -> float:
+        """Part of the budget that is used up, 1 at the end."""
+        return budget.share(self._counters.step, self._counters.elapsed_s)
+
+    def _step(
+        self,
+        policy: "HvsPolicy",
+        optimizer: torch.optim.Optimizer,
+        batch: dict[str, torch.Tensor],
+        demonstrations: Demonstrations,
+        settings: Settings,
+    ) -> tuple[float, dict[str, float]]:
+        """Learn from a batch, and from frames of which the head alone learns.
+
+        Returns:
+            The loss, and what it is made of.
+
+        Raises:
+            PolicyError: It is no number any more.
+        """
+        step = self._counters.step
+        lesson = policy.supervise(batch)
+        loss, parts = lesson.loss, lesson.parts
+        if settings.rehearsal_frames:
+            extra = _rehearse(policy, demonstrations, lesson, settings, step)
+            parts["rehearsal_loss"] = extra.item()
+            loss = loss + extra
+        optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), GRADIENT_NORM)
+        # Before the step: a weight that is no number would spread through all the others.
+        if not math.isfinite(loss.item()) or not math.isfinite(norm.item()):
+            raise PolicyError(
+                f"training came apart at step {step + 1} (loss {loss.item()}, gradient "
+                f"{norm.item()}); {self._out} keeps its last checkpoint; train anew on other data, "
+                "or with a lower learning rate"
+            )
+        optimizer.step()
+        return loss.item(), parts
+
+    def finish(self, policy: "HvsPolicy") -> Outcome:
+        """What the sitting came to, written and drawn."""
+        outcome = Outcome(
             step=self._counters.step,
             train_s=self._counters.elapsed_s,
             decode_s=self._decode_s,
@@ -382,6 +348,10 @@ class _Run:
             held_out_loss=self._held_out_loss,
             n_parameters=sum(p.numel() for p in policy.parameters()),
         )
+        with replacing(self._out / "training" / "outcome.json") as temporary:
+            temporary.write_text(json.dumps(dataclasses.asdict(outcome), indent=2) + "\n")
+        draw_run(self._out)
+        return outcome
 
     def _reopen(self, demonstrations: Demonstrations, folder: Path) -> bool:
         """Learn from a round if it was played."""
@@ -530,11 +500,3 @@ def _held_out(policy: "HvsPolicy", demonstrations: Demonstrations) -> dict[str, 
                 sums[name] = sums.get(name, 0.0) + value * len(part)
     policy.train()
     return {name: value / len(indices) for name, value in sums.items()}
-
-
-def _check_budget(minutes: float | None, steps: int | None) -> None:
-    if minutes is None and steps is None:
-        raise OptionError("say how long to train: give minutes or steps")
-    for name, value in (("minutes", minutes), ("steps", steps)):
-        if value is not None and not (value > 0 and math.isfinite(value)):
-            raise OptionError(f"{name} must be above 0, not {value}")

@@ -2,8 +2,9 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import nn
@@ -11,10 +12,11 @@ from torch import nn
 from hvs_suite.datasets.features import ACTION_EXECUTED
 from hvs_suite.errors import OptionError, PolicyError
 from hvs_suite.policies.checkpoints.files import read_config
-from hvs_suite.policies.checkpoints.loading import load_network
-from hvs_suite.policies.checkpoints.trained_for import trained_for
+from hvs_suite.policies.checkpoints.loading import load_network, weights_digest
+from hvs_suite.policies.hvs.dataset import Manifest, calibration_of
 from hvs_suite.policies.hvs.network import IMAGE_PREFIX, STATE, Eye
-from hvs_suite.policies.imitation.demonstrations import Manifest, calibration_of
+from hvs_suite.policies.imitation.frame_cache import fingerprint
+from hvs_suite.policies.trained_for import trained_for
 from hvs_suite.registry import find
 
 if TYPE_CHECKING:
@@ -28,32 +30,34 @@ class Settings:
     Attributes:
         seed: Of initial weights, held-out episodes and order.
         batch_size: Frames a step.
-        learning_rate: Peak of the schedule.
-        dagger_rounds: Rounds of DAgger.
+        learning_rate: Peak of the schedule (a short warm-up, then a cosine to zero).
+        dagger_rounds: How often to let the policy play, the expert labelling every step, and to add
+            those frames.
         dagger_frames: Frames a round.
         dataset: Fingerprint of the dataset.
         task: Named task that it was recorded on.
-        inputs: What the policy is given; None for all.
+        inputs: What the policy is given, of ``eih``, ``eth`` and ``joints``; None for all.
         episodes: Learn from the first so many demonstrations alone; None from all.
-        rehearsal_frames: Frames a step that the head alone learns from.
-        keypoint_weight: Of the policy.
-        error_scale: Of the policy.
+        rehearsal_frames: Frames a step that the head alone learns from, without their images; see
+            `hvs_suite.policies.hvs.rehearsal`.
+        keypoint_weight: Weight of the supervision by ``privileged.*``; 0 trains on actions alone.
+        error_scale: See `HvsConfig`.
         eyes: SHA-256 of the weights whose eyes it begins with; None for fresh ones.
     """
 
-    seed: int
-    batch_size: int
-    learning_rate: float
-    dagger_rounds: int
-    dagger_frames: int
+    seed: int = 0
+    batch_size: int = 64
+    learning_rate: float = 2e-3
+    dagger_rounds: int = 0
+    dagger_frames: int = 6000
     dataset: str
     task: str
-    inputs: tuple[str, ...] | None
-    episodes: int | None
-    rehearsal_frames: int
-    keypoint_weight: float
+    inputs: tuple[str, ...] | None = None
+    episodes: int | None = None
+    rehearsal_frames: int = 512
+    keypoint_weight: float = 1.0
     error_scale: float
-    eyes: str | None
+    eyes: str | None = None
 
     def check(self, manifest: Manifest) -> None:
         """Refuse numbers that make no sense.
@@ -82,14 +86,30 @@ class Settings:
             raise OptionError(f"error_scale must be above 0, not {self.error_scale}")
 
 
-def tightest_scale(manifest: Manifest) -> float:
-    """Five times the tightest tolerance of a dataset's task (m), see `HvsConfig.error_scale`.
+def settings_for(manifest: Manifest, eyes: Path | None, chosen: Mapping[str, Any]) -> Settings:
+    """The settings of a run on a dataset.
 
     Args:
         manifest: Of the dataset.
+        eyes: Checkpoint of a policy to take the eyes of; None for fresh ones.
+        chosen: Fields that differ from the defaults; ``error_scale`` is five times the task's
+            tightest tolerance (m) where it is None.
+
+    Raises:
+        OptionError: A number makes no sense.
     """
-    task = find(manifest.task).with_options(manifest.options)
-    return 5e-3 * task.tightest_tolerance_mm
+    chosen = dict(chosen)
+    if chosen.get("error_scale") is None:
+        task = find(manifest.task).with_options(manifest.options)
+        chosen["error_scale"] = 5e-3 * task.tightest_tolerance_mm
+    settings = Settings(
+        **chosen,
+        dataset=fingerprint(manifest.root),
+        task=manifest.task,
+        eyes=None if eyes is None else weights_digest(eyes),
+    )
+    settings.check(manifest)
+    return settings
 
 
 def trails_its_set_point(manifest: Manifest) -> bool:

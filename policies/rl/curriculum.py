@@ -106,19 +106,19 @@ class Curriculum(gymnasium.Wrapper[Any, Any, Any, Any]):
         """The level now, from 0."""
         return self._level
 
-    def standing(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         """Level and outcomes that decide on the next, as JSON has it."""
         return {"level": self._level, "recent": list(self._recent)}
 
-    def restore(self, standing: Mapping[str, Any]) -> None:
-        """Go to where `standing` said that it was.
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go to where `state_dict` said that it was.
 
         Args:
-            standing: As `standing` gave it.
+            state: As `state_dict` gave it.
         """
         self._recent.clear()
-        self._recent.extend(bool(outcome) for outcome in standing["recent"])
-        self._go_to(int(standing["level"]))
+        self._recent.extend(bool(outcome) for outcome in state["recent"])
+        self._go_to(int(state["level"]))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -26,7 +26,7 @@ from hvs_suite.policies.checkpoints.files import (
     read_settings,
     read_shapes,
 )
-from hvs_suite.policies.checkpoints.trained_for import TrainedFor, check_trained_for, trained_for
+from hvs_suite.policies.trained_for import TrainedFor, check_trained_for, trained_for
 from hvs_suite.rollout import Observation, one_torch_thread
 from hvs_suite.tasks.shared.spec import Spec, observation_names
 

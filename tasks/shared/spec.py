@@ -307,6 +307,16 @@ class Spec(Timing, Cameras, Disturbances):
         units = {metric.name: metric.unit for metric in self.metrics}
         return min(bound for name, bound in self.step_bounds.items() if units[name] == "mm")
 
+    @property
+    def fps(self) -> int:
+        """Control steps a second, to the nearest whole number."""
+        return round(1.0 / self.control_period_s)
+
+    @property
+    def landing_metric(self) -> Metric | None:
+        """The distance from the goal in its plane that counts; None where nothing lands."""
+        return None
+
     def instruction(self, scenario: "Scenario | None" = None) -> str:
         """The task as one sentence, identical in environment and dataset.
 
@@ -344,11 +354,6 @@ class Spec(Timing, Cameras, Disturbances):
     def reach_m(self) -> float:
         """Largest distance of a goal from the base's axis (m), which scales shaped rewards."""
         return 0.78
-
-    @property
-    def camera_names(self) -> tuple[str, ...]:
-        """Observations that are colour pictures, in order."""
-        return tuple(name for name in observation_names(self.observations) if name in CAMERA_NAMES)
 
     @property
     def scene_fields(self) -> tuple[str, ...]:

@@ -8,7 +8,8 @@ import pytest
 
 from hvs_suite.cli.main import run
 from hvs_suite.datasets.check import check_dataset
-from hvs_suite.eval.scoring import protocol, result_file, verification
+from hvs_suite.eval import protocol
+from hvs_suite.eval.scoring import result_file, verification
 from hvs_suite.eval.serving import policy_session
 from hvs_suite.eval.serving.remote_policy import hello
 from hvs_suite.registry import load

@@ -15,7 +15,7 @@ from hvs_suite.cli.main import run
 from hvs_suite.datasets import publication, reader
 from hvs_suite.datasets.recompression import VideoCopy
 from hvs_suite.errors import DatasetError, OptionError, OutputError
-from hvs_suite.eval.scoring import protocol
+from hvs_suite.eval import protocol
 from hvs_suite.eval.studies import compression, compression_report
 from hvs_suite.eval.studies.compression import Training, parse_setting, run_study
 from hvs_suite.eval.studies.compression_figures import Row, Study, Success

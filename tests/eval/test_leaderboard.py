@@ -15,11 +15,11 @@ from forgeries import with_errors
 from test_result_file import make_result, of_rows, row
 
 from hvs_suite.errors import OptionError, OutputError, ResultError
-from hvs_suite.eval import leaderboard
+from hvs_suite.eval import leaderboard, protocol
 from hvs_suite.eval.board import clips, matrix, plots, replay_check, submission, tables
 from hvs_suite.eval.board.page import page
 from hvs_suite.eval.board.tables import Entry
-from hvs_suite.eval.scoring import protocol, result_file, verification
+from hvs_suite.eval.scoring import result_file, verification
 
 ROOT = Path(__file__).parents[2]
 COMMITTED = ROOT / "eval"

@@ -8,11 +8,11 @@ from forgeries import with_errors
 from test_result_file import make_result
 
 from hvs_suite.errors import ResultError
-from hvs_suite.eval import leaderboard
+from hvs_suite.eval import leaderboard, protocol
 from hvs_suite.eval.board import tables
 from hvs_suite.eval.board.page import page
 from hvs_suite.eval.board.tables import Entry
-from hvs_suite.eval.scoring import comparison, protocol, result_file, verification
+from hvs_suite.eval.scoring import comparison, result_file, verification
 from hvs_suite.eval.studies import failures
 from hvs_suite.registry import find
 

@@ -12,8 +12,9 @@ from forgeries import rewrite, with_log
 
 from hvs_suite.cli import main
 from hvs_suite.errors import ResultError
+from hvs_suite.eval import protocol
 from hvs_suite.eval.board import ours, submission
-from hvs_suite.eval.scoring import action_log, protocol, result_file, verification
+from hvs_suite.eval.scoring import action_log, result_file, verification
 
 RESULTS = Path(__file__).parents[2] / "eval" / "results"
 COMMITTED = sorted(RESULTS.rglob("*.json"))

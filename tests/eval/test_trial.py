@@ -18,7 +18,8 @@ import pytest
 import hvs_suite
 from hvs_suite.cli import main
 from hvs_suite.errors import OutputError
-from hvs_suite.eval.scoring import action_log, protocol, provenance, result_file
+from hvs_suite.eval import protocol
+from hvs_suite.eval.scoring import action_log, provenance, result_file
 from hvs_suite.policies.catalogue import policy_factory
 from hvs_suite.registry import TASKS
 from hvs_suite.rollout import run_episode

@@ -15,8 +15,9 @@ from dm_env import specs
 
 from hvs_suite.cli import main
 from hvs_suite.errors import ResultError
+from hvs_suite.eval import protocol
 from hvs_suite.eval.board import clips
-from hvs_suite.eval.scoring import protocol, result_file, verification
+from hvs_suite.eval.scoring import result_file, verification
 from hvs_suite.eval.scoring.result_file import EpisodeRow, Summary
 from hvs_suite.eval.scoring.trial import EpisodeLostError, play_trial
 from hvs_suite.eval.studies import failures

@@ -11,8 +11,9 @@ from safetensors.torch import load_file
 import hvs_suite
 from hvs_suite.datasets.expert import Expert
 from hvs_suite.errors import OptionError
+from hvs_suite.policies.hvs.dataset import read_manifest
 from hvs_suite.policies.imitation.dagger import play_round, read_round, round_shares
-from hvs_suite.policies.imitation.demonstrations import Demonstrations, read_manifest
+from hvs_suite.policies.imitation.demonstrations import Demonstrations
 from hvs_suite.policies.imitation.pretrain import pretrain
 
 SIDE = 28

@@ -321,7 +321,7 @@ def test_scenes_that_were_lost_come_again_in_turn_between_new_ones():
     played = journal.unwrapped.played
     assert played == [0, 1, 2, 2, 3, 3, 4, 2, 5]
     restored = Journal(LoseThose({2, 3}), seed=0, lost_share=0.5)
-    restored.go_to(journal.place())
+    restored.load_state_dict(journal.state_dict())
     for each in (journal, restored):
         each.reset()
     assert restored.unwrapped.played == journal.unwrapped.played[9:]
@@ -371,7 +371,7 @@ def pretend(monkeypatch, rates):
     def evaluate(self, policy, env_steps, updates, clip=None, on_episode=None):
         return Evaluation(env_steps, updates, 100, 0.0, 1.0, next(coming), 0.0, {})
 
-    monkeypatch.setattr("hvs_suite.policies.rl.evaluation.Examiner.evaluate", evaluate)
+    monkeypatch.setattr("hvs_suite.policies.rl.evaluation.Evaluator.evaluate", evaluate)
 
 
 @pytest.mark.parametrize(("success", "keeps"), [(0.8, False), (0.9, True)])

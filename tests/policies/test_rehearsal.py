@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from hvs_suite.policies.hvs.dataset import read_manifest
 from hvs_suite.policies.hvs.network import Sighting
 from hvs_suite.policies.hvs.rehearsal import drawn_sightings
-from hvs_suite.policies.imitation.demonstrations import Demonstrations, read_manifest
+from hvs_suite.policies.imitation.demonstrations import Demonstrations
 from hvs_suite.policies.imitation.pretrain import pretrain
 
 

@@ -12,8 +12,8 @@ from hvs_suite.errors import PolicyError
 from hvs_suite.eval.scoring import result_file
 from hvs_suite.policies.catalogue import policy_factory
 from hvs_suite.policies.checkpoints.card import write_card
-from hvs_suite.policies.checkpoints.trained_for import check_trained_for, trained_for
 from hvs_suite.policies.imitation.pretrain import pretrain
+from hvs_suite.policies.trained_for import check_trained_for, trained_for
 from hvs_suite.registry import TASKS
 
 TASK = "align-easy"

@@ -354,7 +354,7 @@ def test_bench_compares_with_a_loop_that_ends_in_the_same_pictures():
     import numpy as np
 
     import hvs_suite
-    from hvs_suite.cli.bench import BareLoop, run_once
+    from hvs_suite.cli.bench_simulation import BareLoop, run_once
 
     with hvs_suite.load("align-thesis") as env:
         episode = run_once(env, 3)
