@@ -8,7 +8,7 @@ from dm_control import mjcf
 from hvs_suite.cell import gl
 
 
-class Physics(mjcf.Physics):  # type: ignore[misc] - dm_control has no types
+class Physics(mjcf.Physics):
     """A physics that others draw as well: our renderer, ``mujoco.Renderer``, other environments."""
 
     @property
