@@ -120,7 +120,7 @@ def record(
         outcomes = published_outcomes(root)
         tracker = _Tracker(len(outcomes), sum(outcomes), episodes, progress)
         fps = round(1.0 / spec.control_period_s)
-        writer = DatasetWriter(root, features, fps, spec.instruction(), block)
+        writer = DatasetWriter(root, features, fps, block)
         played = play(
             MakeEnvironment(task, split, dict(options or {})),
             make_demonstrator,

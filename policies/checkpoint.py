@@ -41,7 +41,7 @@ from hvs_suite.policies.hvs.network import (
 )
 from hvs_suite.policies.trained_for import check_trained_for
 from hvs_suite.rollout import Observation, one_torch_thread
-from hvs_suite.tasks.shared.spec import Spec, observation_names
+from hvs_suite.tasks.shared.spec import Spec
 
 Action = npt.NDArray[np.float32]
 Decide = Callable[[dict[str, Tensor]], Tensor]
@@ -131,7 +131,8 @@ def as_batch(observation: Observation, keys: Iterable[str]) -> dict[str, Tensor]
 
     Args:
         observation: As in `CheckpointPolicy.select_action`.
-        keys: What is read of it: ``observation.images.<camera>`` and ``observation.state``.
+        keys: What is read of it: ``observation.images.<camera>``, ``observation.state`` and
+            ``observation.<name>``, what else a family shows.
 
     Returns:
         Images (C, H, W) in [0, 1] and the state (14,) or (7,), float32, no batch dimension.
@@ -145,6 +146,9 @@ def as_batch(observation: Observation, keys: Iterable[str]) -> dict[str, Tensor]
             parts = ["joint_positions", "joint_velocities"]
             joints = [observation[name] for name in parts if name in observation]
             batch[key] = torch.from_numpy(np.concatenate(joints).astype(np.float32))
+        else:
+            vector = observation[key.removeprefix(VECTOR_PREFIX)]
+            batch[key] = torch.from_numpy(vector.astype(np.float32))
     return batch
 
 
@@ -187,7 +191,7 @@ def check_fit(config: Mapping[str, Any], folder: Path, spec: Spec) -> None:
     """
     if config.get("type") == "hvs":
         check_trained_for(config, folder, spec)
-    shown = observation_names(spec.observations)
+    shown = spec.observed
     mismatch = f"{folder} does not fit {spec.name}: "
     if spec.action_mode != "joint_position" or spec.normalise_observation:
         raise PolicyError(
@@ -204,6 +208,10 @@ def check_fit(config: Mapping[str, Any], folder: Path, spec: Spec) -> None:
                 raise PolicyError(
                     mismatch + f"it reads {shape[0]} joint numbers, the task shows {available}"
                 )
+        elif (vector := key.removeprefix(VECTOR_PREFIX)) in spec.further_observations:
+            size = len(spec.further_observations[vector].dimensions)
+            if vector not in shown or shape != (size,):
+                raise PolicyError(mismatch + f"it reads {key}, which the task shows otherwise")
         elif name == key or name not in shown or name not in ("eih", "eth"):
             raise PolicyError(mismatch + f"it reads {key}, which the task does not show")
         else:

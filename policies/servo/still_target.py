@@ -44,7 +44,6 @@ from hvs_suite.rollout import Observation
 from hvs_suite.tasks.shared.detection import find_discs
 from hvs_suite.tasks.shared.goal import Goal
 from hvs_suite.tasks.shared.placing import PlacingSpec
-from hvs_suite.tasks.shared.spec import observation_names
 
 if TYPE_CHECKING:
     pass
@@ -87,7 +86,7 @@ class StillTargetServo:
         self._planner = Planner(spec.control_period_s)
         self._sight = Sight(spec.target_diameter_m, spec.ring_m)
         self._search = TargetSearch(self._kinematics, spec.ring_m, spec.target_diameter_m)
-        names = observation_names(spec.observations)
+        names = spec.observed
         self._has_eih, self._has_eth = "eih" in names, "eth" in names
         self._eih_K = intrinsics(spec.eih_resolution, spec.eih_fov_deg)
         self._eth_K = intrinsics(spec.eth_resolution, spec.eth_fov_deg)
@@ -282,7 +281,7 @@ def _calibration_sigma(spec: PlacingSpec) -> float:
 
 def _check(spec: PlacingSpec) -> None:
     """Refuse what the method does not do, in a sentence."""
-    names = observation_names(spec.observations)
+    names = spec.observed
     if not {"eih", "eth"} & set(names) or not {"joint_positions", "joint_velocities"} <= set(names):
         raise PolicyError(
             "servo needs a camera, joint_positions and joint_velocities; use the preset 'vision'"
