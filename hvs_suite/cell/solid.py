@@ -98,12 +98,16 @@ class ObstacleDistance:
         self._data = self._model.createData()
         self._geometry_data = self._geometry.createData()
 
-    def __call__(self, q: FloatArray) -> float:
+    def __call__(self, q: npt.ArrayLike) -> float:
         """Least distance (m) at joint angles (7,) rad; negative where the arm is inside."""
         if not len(self._geometry.collisionPairs):
             return math.inf
         nearest = pin.computeDistances(
-            self._model, self._data, self._geometry, self._geometry_data, q
+            self._model,
+            self._data,
+            self._geometry,
+            self._geometry_data,
+            np.asarray(q, dtype=np.float64),
         )
         return float(self._geometry_data.distanceResults[nearest].min_distance)
 
