@@ -77,7 +77,7 @@ class ClutterSpec(PlacingSpec):
     n_obstacles: tuple[int, int] = scene((0, 0))
     obstacle_height_m: tuple[float, float] = scene((0.10, 0.50))
     moves: bool = scene(False)
-    moves_at_s: tuple[float, float] = scene((0.5, 2.5))
+    moves_at_s: tuple[float, float] = scene((0.3, 1.5))
     speed_m_s: tuple[float, float] = scene((0.10, 0.20))
 
     def __post_init__(self) -> None:
@@ -173,7 +173,7 @@ class ClutterScenario(Scenario):
         target: Centre of the target, (3,) m, base frame.
         colour: Its colour.
         placed: Everything that lies or stands there, the target included.
-        way: Postures of the way that is free of obstacles, (2, 7) rad; (0, 7) without obstacles.
+        way: Postures of the way that is free of obstacles, (3, 7) rad; (0, 7) without obstacles.
         motion: When the first obstacle begins to move (s), and its speed (m/s), (2,); None where
             none moves.
     """

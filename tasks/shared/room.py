@@ -1,11 +1,12 @@
 """Room for obstacles: they are put where a known way of the arm stays free.
 
-The stated rule by which scenes with obstacles can be solved: two straight joint motions, from the
-start to the upright arm and from there to a posture at the goal, keep a margin from everything. The
-posture is drawn among all that reach the goal, so the free way is seldom the shortest, and it is
-part of the scenario.
+The stated rule by which scenes with obstacles can be solved: three straight joint motions, from the
+start to the upright arm, from there to a posture above the goal and down to it, keep a margin from
+everything. The posture is drawn among all that reach the goal, so the free way is seldom the
+shortest, and it is part of the scenario.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -13,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.cell.kinematics import kinematics
+from hvs_suite.cell.robot import JOINT_SPEED_RAD_S
 from hvs_suite.cell.solid import Solid, arm_balls
 from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared.goal import Goal
@@ -23,6 +25,8 @@ MARGIN_M = 0.04
 """What the free way keeps from obstacles (m)."""
 LEAST_CLEARANCE_M = 0.02
 """What it keeps from the surface and between links (m)."""
+APPROACH_M = 0.15
+"""How far above the goal the way comes in (m)."""
 SIGHT_RADIUS_M = 0.05
 SIGHT_HEIGHT_M = 0.25
 """The air above the target that stays free, so that the eye in the hand looks down on it (m)."""
@@ -41,7 +45,7 @@ def straight(here: FloatArray, there: FloatArray) -> FloatArray:
 
 
 def draw_way(random: np.random.Generator, start: FloatArray, goal: Goal) -> FloatArray:
-    """Draw the way that stays free: the upright arm, then a posture at the goal.
+    """Draw the way that stays free: upright, then above the goal, then at the goal.
 
     Args:
         random: Draws the posture.
@@ -49,7 +53,7 @@ def draw_way(random: np.random.Generator, start: FloatArray, goal: Goal) -> Floa
         goal: Where the tip has to be.
 
     Returns:
-        (2, 7) rad.
+        (3, 7) rad.
 
     Raises:
         OptionError: No posture can be reached in a straight motion.
@@ -58,10 +62,18 @@ def draw_way(random: np.random.Generator, start: FloatArray, goal: Goal) -> Floa
     family = kinematics().goal_configurations_at_tool_angle(
         goal.position, goal.normal, float(start[6]), _N_SWIVEL
     )
+    above = goal.position + APPROACH_M * goal.normal
     for row in random.permutation(len(family)):
-        way = np.linspace(upright, family[row], _SAMPLES)[1:]
+        raised = kinematics().nearest_configuration(
+            family[row], above, goal.normal, JOINT_SPEED_RAD_S
+        )
+        if raised is None:
+            continue
+        # The last joint turns the flange about its own axis, which need not be.
+        raised[6] = start[6]
+        way = [*np.linspace(upright, raised, _SAMPLES)[1:], family[row]]
         if all(kinematics().clearance(q, goal.target[2]) >= LEAST_CLEARANCE_M for q in way):
-            return np.stack([upright, family[row]])
+            return np.stack([upright, raised, family[row]])
     raise OptionError(
         f"no free way found to the goal at {goal.position.round(3).tolist()}; use other radii "
         "in ring_m"
@@ -79,7 +91,8 @@ class Room:
 
     def __init__(self, start: FloatArray, way: FloatArray, target: FloatArray) -> None:
         balls = arm_balls()
-        postures = np.concatenate([straight(start, way[0]), straight(way[0], way[1])])
+        stations = [start, *way]
+        postures = np.concatenate([straight(*leg) for leg in itertools.pairwise(stations)])
         arm = balls.at(postures).reshape(-1, 3)
         sight = target + np.outer(np.linspace(0.0, SIGHT_HEIGHT_M, 10), [0.0, 0.0, 1.0])
         base = np.outer(np.linspace(0.0, _BASE_HEIGHT_M, 10), [0.0, 0.0, 1.0])
