@@ -23,6 +23,11 @@ from hvs_suite.tasks.shared.detection import find_discs, is_whole_disc
 
 FloatArray = npt.NDArray[np.float64]
 
+_SAFE_HEIGHT_M = 0.55
+"""Where the flange is above the highest obstacle (m)."""
+_UP_RAD = 0.15
+"""The arm is as good as upright when no joint is farther from zero than this."""
+
 
 class AmongOthersServo(StillTargetServo):
     """Servoes the right one of several things; follows :class:`hvs_suite.rollout.Policy`.
@@ -35,6 +40,9 @@ class AmongOthersServo(StillTargetServo):
     """
 
     def __init__(self, spec: ClutterSpec) -> None:
+        self._has_obstacles = spec.n_obstacles[1] > 0
+        if self._has_obstacles:
+            self.look_height_m = _SAFE_HEIGHT_M
         self._colours = spec.colours
         self._colour = spec.colours[0]
         super().__init__(spec)
@@ -44,6 +52,22 @@ class AmongOthersServo(StillTargetServo):
         if GOAL_COLOUR in observation:
             self._colour = self._colours[int(np.argmax(observation[GOAL_COLOUR]))]
         return super().select_action(observation)
+
+    def reset(self) -> None:
+        """Forget the last episode."""
+        super().reset()
+        self._is_up = not self._has_obstacles
+
+    def _next_set_point(self, q: FloatArray) -> FloatArray:
+        """Where the set point (7,) shall be at the end of the control step: first of all, up."""
+        if not self._is_up:
+            angles, speeds, _ = self._belief.when_action_acts()
+            self._is_up = bool(np.abs(angles[:6]).max() < _UP_RAD)
+            upright = np.append(np.zeros(6), angles[6])
+            ahead = self._planner.towards_posture(angles, speeds, upright)
+            if not self._is_up and ahead is not None:
+                return ahead
+        return super()._next_set_point(q)
 
     def _sighting(self, image: npt.NDArray[Any], K: FloatArray, T: FloatArray) -> Sighting | None:
         """The first patch of a picture that has the target's colour, size and outline."""

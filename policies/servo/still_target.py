@@ -51,7 +51,6 @@ if TYPE_CHECKING:
 FloatArray = npt.NDArray[np.float64]
 
 _UP = np.array([0.0, 0.0, 1.0])
-_LOOK_HEIGHT_M = 0.30
 _MAX_HOVER_M = 0.40
 _VIEW_SHARE = 0.9
 """Share of the eye-in-hand camera's half view that the target has to lie within."""
@@ -68,6 +67,7 @@ class StillTargetServo:
 
     Attributes:
         max_misses: How often the eye in the hand may miss a target that it should see.
+        look_height_m: How high the flange hovers while it looks for a target (m).
 
     Args:
         spec: The task's parameters.
@@ -77,6 +77,7 @@ class StillTargetServo:
     """
 
     max_misses = 6
+    look_height_m = 0.30
 
     def __init__(self, spec: PlacingSpec) -> None:
         _check(spec)
@@ -230,14 +231,14 @@ class StillTargetServo:
         until there is nothing left to see from it.
         """
         hidden = self._search.possible
-        radius = self._half_view * _LOOK_HEIGHT_M
+        radius = self._half_view * self.look_height_m
         if self._look is not None and _near(hidden, self._look, radius).any():
             return self._look
         best, self._look = -1.0, None
         choices = hidden[np.unique(np.linspace(0, len(hidden) - 1, _LOOK_CHOICES).astype(int))]
         for choice in choices:
             covered = hidden[_near(hidden, choice, radius)]
-            goal = within_reach(np.array([*covered[:, :2].mean(axis=0), _LOOK_HEIGHT_M]))
+            goal = within_reach(np.array([*covered[:, :2].mean(axis=0), self.look_height_m]))
             family = self._kinematics.goal_configurations_at_tool_angle(goal, _UP, q[6])
             if not len(family):
                 continue
@@ -246,7 +247,7 @@ class StillTargetServo:
             if worth > best:
                 best, self._look = worth, goal
         if self._look is None:
-            self._look = within_reach(np.array([*choices[0, :2], _LOOK_HEIGHT_M]))
+            self._look = within_reach(np.array([*choices[0, :2], self.look_height_m]))
         return self._look
 
 
