@@ -105,9 +105,9 @@ class Roadmap:
         for q in family[np.argsort(times, kind="stable")]:
             if len(found) == _N_GOALS:
                 break
-            if all(np.abs(q - other).max() >= _DISTINCT_RAD for other in found):
-                if self._clearance(q) >= CLEARANCE_M:
-                    found.append(q)
+            is_new = all(np.abs(q - other).max() >= _DISTINCT_RAD for other in found)
+            if is_new and self._clearance(q) >= CLEARANCE_M:
+                found.append(q)
         return found
 
     def _leads_to_goal(self, node: int) -> bool:

@@ -44,7 +44,12 @@ from hvs_suite.rollout import Observation, one_torch_thread
 from hvs_suite.tasks.shared.spec import Spec
 
 Action = npt.NDArray[np.float32]
-Decide = Callable[[dict[str, Tensor]], Tensor]
+Batch = dict[str, Any]
+"""Tensors under LeRobot's names, and the task as a sentence."""
+Decide = Callable[[Batch], Tensor]
+
+VECTOR_PREFIX = "observation."
+TASK = "task"
 
 # Where the network's own keys live in a checkpoint of the LeRobot policy around it.
 NETWORK_PREFIX = "network."
@@ -105,7 +110,12 @@ class CheckpointPolicy:
             if config.get("type") == "hvs" and _processors_are_standard(folder):
                 self._decide, self._forget = _network(folder, config)
             else:
-                self._decide, self._forget = _lerobot(folder, spec.instruction())
+                self._decide, self._forget = _lerobot(folder)
+        self._sentence = spec.instruction()
+
+    def instruct(self, sentence: str) -> None:
+        """Take in the task of the coming episode as a sentence."""
+        self._sentence = sentence
 
     def reset(self) -> None:
         """Forget the last episode."""
@@ -122,7 +132,7 @@ class CheckpointPolicy:
             (7,) float32.
         """
         with one_torch_thread(), torch.inference_mode():
-            action = self._decide(as_batch(observation, self._inputs))
+            action = self._decide({**as_batch(observation, self._inputs), TASK: self._sentence})
         return np.array(action.reshape(-1).cpu().numpy(), np.float32)
 
 
@@ -321,7 +331,7 @@ def _nothing() -> None:
     """Forget nothing: a policy without joints has no memory."""
 
 
-def _lerobot(folder: Path, instruction: str) -> tuple[Decide, Callable[[], None]]:
+def _lerobot(folder: Path) -> tuple[Decide, Callable[[], None]]:
     """Load any LeRobot policy with its processors, on the CPU."""
     try:
         from lerobot.configs import PreTrainedConfig
@@ -350,8 +360,8 @@ def _lerobot(folder: Path, instruction: str) -> tuple[Decide, Callable[[], None]
     except Exception as error:  # LeRobot and what it loads raise anything
         raise PolicyError(f"LeRobot cannot load {folder}: {first_line(error)}") from error
 
-    def decide(batch: dict[str, Tensor]) -> Tensor:
-        action: Tensor = after(policy.select_action(before({**batch, "task": instruction})))
+    def decide(batch: Batch) -> Tensor:
+        action: Tensor = after(policy.select_action(before(batch)))
         return action
 
     return decide, policy.reset

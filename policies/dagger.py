@@ -25,7 +25,7 @@ from hvs_suite.policies.checkpoint import CheckpointFactory
 from hvs_suite.policies.demonstrations import Manifest, Recording
 from hvs_suite.policies.frame_cache import new_frames, open_frames
 from hvs_suite.policies.hvs.network import IMAGE_PREFIX
-from hvs_suite.rollout import Policy, play
+from hvs_suite.rollout import Policy, play, tell
 
 if TYPE_CHECKING:
     from hvs_suite.tasks.shared.environment import Environment
@@ -100,6 +100,7 @@ def _played(
     env: "Environment", policy: Policy, scenario: int, label: Callable[[], Frame]
 ) -> PlayedEpisode:
     time_step = env.reset(scenario=scenario)
+    tell(policy, env)
     policy.reset()
     frames: list[Frame] = []
     while not time_step.last():

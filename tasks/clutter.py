@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from hvs_suite.cell.solid import Solid
     from hvs_suite.tasks.shared.certificate import Check
     from hvs_suite.tasks.shared.environment import Environment
+    from hvs_suite.tasks.shared.room import Room
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -49,6 +50,7 @@ LANE_M = 0.30
 _PACKING = 0.3
 """Share of the ring that things may fill with the room that they keep; more is seldom found."""
 _MAX_REDRAWS = 1000
+_MAX_STANDINGS = 200
 _HEIGHT_M = 0.50
 """Of all obstacles in the model; a lower one is sunk into the table."""
 _GREYS = ((0.93, 0.93, 0.90, 1.0), (0.30, 0.33, 0.38, 1.0), (0.55, 0.42, 0.28, 1.0))
@@ -89,9 +91,7 @@ class ClutterSpec(PlacingSpec):
         super().__post_init__()
         for colour in self.colours:
             if colour not in COLOURS:
-                raise OptionError(
-                    f"colours has {colour!r}, which is none of {', '.join(COLOURS)}"
-                )
+                raise OptionError(f"colours has {colour!r}, which is none of {', '.join(COLOURS)}")
         if not self.colours or len(set(self.colours)) < len(self.colours):
             raise OptionError(f"colours is {self.colours}; name one or several, each once")
         for name in ("n_distractors", "n_obstacles", "moves_at_s", "speed_m_s"):
@@ -187,6 +187,8 @@ class ClutterScenario(Scenario):
 
 class Clutter(Placing[ClutterSpec, ClutterScenario]):
     """One target among other things."""
+
+    certificate_passes: ClassVar[int] = 4
 
     def build(self, cell: "Cell") -> None:
         """Attach the target's discs and all props."""
@@ -305,26 +307,45 @@ class Clutter(Placing[ClutterSpec, ClutterScenario]):
         """Put obstacles where a way stays free; the first but the moving one near the target."""
         from hvs_suite.tasks.shared.room import Room, draw_way
 
-        spec = self.spec
-        way = draw_way(random, start, goal)
-        room = Room(start, way, goal.target)
-        low, high = spec.n_obstacles
-        others = [name for name in self._obstacles if name != "carriage"]
-        count = int(random.integers(low, high + 1)) - spec.moves
-        names = [others[i] for i in random.permutation(len(others))[:count]]
-        placed = []
-        for number, name in enumerate(["carriage"] * spec.moves + names):
-            is_near = number == spec.moves
-            for _ in range(_MAX_REDRAWS):
-                pose = self._draw_standing(random, name, goal.target, is_near=is_near)
-                solids = self._solids(Placed(name, pose), whole_way=True)
+        low, high = self.spec.n_obstacles
+        moving = ["carriage"] * self.spec.moves
+        others = [name for name in self._obstacles if name not in moving]
+        for _ in range(_MAX_REDRAWS):
+            way = draw_way(random, start, goal)
+            room = Room(start, way, goal.target)
+            count = int(random.integers(low, high + 1))
+            names = [*moving, *(others[i] for i in random.permutation(len(others)))][:count]
+            placed = []
+            for number, name in enumerate(names):
+                is_near = number == self.spec.moves
+                found = self._find_room(random, room, name, goal.target, is_near=is_near)
+                placed += [] if found is None else [found]
+            has_all = set(moving) <= {each.prop for each in placed}
+            if len(placed) >= low and has_all:
+                return way, placed
+        raise OptionError(
+            f"no room for {low} obstacles around the way to {goal.target.round(3).tolist()}; lower "
+            "n_obstacles"
+        )
+
+    def _find_room(
+        self,
+        random: np.random.Generator,
+        room: "Room",
+        name: str,
+        target: FloatArray,
+        *,
+        is_near: bool,
+    ) -> Placed | None:
+        """Put an obstacle where it fits: near the target if there is room, or anywhere."""
+        for near in (True, False) if is_near else (False,):
+            for _ in range(_MAX_STANDINGS):
+                placed = Placed(name, self._draw_standing(random, name, target, is_near=near))
+                solids = self._solids(placed, whole_way=True)
                 if room.fits(solids):
-                    break
-            else:
-                continue
-            room.add(solids)
-            placed.append(Placed(name, pose))
-        return way, placed
+                    room.add(solids)
+                    return placed
+        return None
 
     def _draw_standing(
         self, random: np.random.Generator, name: str, target: FloatArray, *, is_near: bool
@@ -404,6 +425,11 @@ class Clutter(Placing[ClutterSpec, ClutterScenario]):
         meant = [float(colour == self.scenario.colour) for colour in self.spec.colours]
         return {GOAL_COLOUR: np.array(meant)}
 
+    def things(self) -> list[tuple[str, FloatArray]]:
+        """Colour and outline of what lies on the surface, and where (2,) m; the target first."""
+        flat = [p for p in self.scenario.placed if p.prop not in self._obstacles]
+        return [(_kind(each.prop), each.pose[:2]) for each in flat]
+
     def obstacles(self) -> tuple["Solid", ...]:
         """All obstacles; the one that moves with all its lane until it rests."""
         standing = [p for p in self.scenario.placed if p.prop in self._obstacles]
@@ -419,10 +445,23 @@ class Clutter(Placing[ClutterSpec, ClutterScenario]):
     def certify(cls, env: "Environment", scenarios: Iterable[int]) -> list["Check"]:
         """Reachable, in time, unambiguous, observable and accurate; a clear way where needed."""
         from hvs_suite.tasks.shared import certificate
+        from hvs_suite.tasks.shared import certificate_room as room
 
         return [
             *certificate.check_geometry(env, scenarios),
+            *room.check_unambiguous(env, scenarios),
+            *(
+                room.check_clear_way(env, scenarios)
+                if env.task.family.spec.n_obstacles[1]
+                else certificate.check_visibility(env, scenarios, room.find_by_outline, 95.0)
+            ),
+            *certificate.check_accuracy(env, scenarios, room.find_by_outline),
         ]
+
+
+def _kind(prop: str) -> str:
+    """Outline and colour of a flat prop, without its number."""
+    return prop.split("-", 2)[2] if prop.startswith("thing-") else prop
 
 
 def _range(numbers: tuple[int, int]) -> str:
@@ -440,9 +479,7 @@ _DISTRACTORS = ClutterSpec(
 register(
     Clutter,
     _DISTRACTORS,
-    dataclasses.replace(
-        _DISTRACTORS, name="clutter-choice", n_distractors=(0, 0), colours=COLOURS
-    ),
+    dataclasses.replace(_DISTRACTORS, name="clutter-choice", n_distractors=(0, 0), colours=COLOURS),
     ClutterSpec(
         name="clutter-obstacles",
         start="random",

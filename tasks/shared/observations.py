@@ -15,6 +15,7 @@ from dm_env import specs
 
 from hvs_suite.cell import cameras
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
+
 if TYPE_CHECKING:
     from hvs_suite.tasks.shared.arm_task import ArmTask
 
