@@ -14,7 +14,7 @@ the paint shows.
 
 import dataclasses
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -24,6 +24,7 @@ from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared.family import register
 from hvs_suite.tasks.shared.goal import Goal
 from hvs_suite.tasks.shared.placing import HARD, Placing, PlacingSpec
+from hvs_suite.tasks.shared.props import Placed, Props
 from hvs_suite.tasks.shared.scenario import Scenario, Streams, draw_look
 from hvs_suite.tasks.shared.spec import Description, VectorObservation, scene
 
@@ -31,11 +32,10 @@ if TYPE_CHECKING:
     from dm_control import mjcf
 
     from hvs_suite.cell.arena import Cell
-    from hvs_suite.cell.prop import Obstacle, Prop
+    from hvs_suite.cell.prop import Shape
     from hvs_suite.cell.solid import Solid
     from hvs_suite.tasks.shared.certificate import Check
     from hvs_suite.tasks.shared.environment import Environment
-    from hvs_suite.tasks.shared.room import Room
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -44,16 +44,14 @@ COLOURS = ("red", "blue", "green", "yellow")
 GOAL_COLOUR = "goal_colour"
 OUTLINES = ("square", "ring", "half disc")
 """What is not the target although it has its colour."""
-MAX_OBSTACLES = 5
-LANE_M = 0.30
-"""How far the obstacle moves that moves (m)."""
+MAX_OBSTACLES = 6
+MAX_HEIGHT_M = 0.50
+"""How many obstacles there are and how high; spelled out for the same reason."""
 _PACKING = 0.3
 """Share of the ring that things may fill with the room that they keep; more is seldom found."""
 _MAX_REDRAWS = 1000
-_MAX_STANDINGS = 200
-_HEIGHT_M = 0.50
-"""Of all obstacles in the model; a lower one is sunk into the table."""
-_GREYS = ((0.93, 0.93, 0.90, 1.0), (0.30, 0.33, 0.38, 1.0), (0.55, 0.42, 0.28, 1.0))
+_MARKER = "disc-red"
+"""The disc that is the marker of all families."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -89,6 +87,8 @@ class ClutterSpec(PlacingSpec):
             OptionError: One of them does not.
         """
         super().__post_init__()
+        if self.marker != "disc":
+            raise OptionError(f"marker is {self.marker!r}; clutter's targets are discs")
         for colour in self.colours:
             if colour not in COLOURS:
                 raise OptionError(f"colours has {colour!r}, which is none of {', '.join(COLOURS)}")
@@ -110,9 +110,9 @@ class ClutterSpec(PlacingSpec):
         if self.n_obstacles[1] > MAX_OBSTACLES:
             raise OptionError(f"n_obstacles is {self.n_obstacles}; use at most {MAX_OBSTACLES}")
         low, high = self.obstacle_height_m
-        if not 0.05 <= low <= high <= _HEIGHT_M:
+        if not 0.05 <= low <= high <= MAX_HEIGHT_M:
             raise OptionError(
-                f"obstacle_height_m is {(low, high)}; use heights from 0.05 to {_HEIGHT_M} m"
+                f"obstacle_height_m is {(low, high)}; use heights from 0.05 to {MAX_HEIGHT_M} m"
             )
         if self.moves and not self.n_obstacles[0]:
             raise OptionError("moves needs an obstacle that can move; raise n_obstacles")
@@ -152,19 +152,6 @@ class ClutterSpec(PlacingSpec):
         return dataclasses.replace(words, target=" ".join([disc, *parts]))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Placed:
-    """A prop that a scene puts somewhere.
-
-    Attributes:
-        prop: Its name.
-        pose: x, y, z (m) and yaw (rad), (4,).
-    """
-
-    prop: str
-    pose: FloatArray
-
-
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class ClutterScenario(Scenario):
     """One scene.
@@ -192,25 +179,27 @@ class Clutter(Placing[ClutterSpec, ClutterScenario]):
 
     def build(self, cell: "Cell") -> None:
         """Attach the target's discs and all props."""
-        from hvs_suite.cell.prop import Lane, Sticker
+        from hvs_suite.cell.prop import Sticker
+        from hvs_suite.tasks.shared.obstacles import Obstacles
 
         super().build(cell)
         spec, size = self.spec, self.spec.target_diameter_m
-        props: list[Prop] = []
-        for colour in spec.colours:
-            if colour != "red":
-                props.append(Sticker(f"disc-{colour}", "disc", colour, size))
+        stickers = [
+            Sticker(_disc(colour), "disc", colour, size)
+            for colour in spec.colours
+            if _disc(colour) != _MARKER
+        ]
+        self._kinds = {_disc(colour): f"{colour} disc" for colour in spec.colours}
+        self._others = []
         for number, (outline, colour) in enumerate(self._distractors()):
-            name = f"thing-{number}-{outline.replace(' ', '-')}-{colour}"
-            props.append(Sticker(name, outline, colour, size))
-        self._obstacles = {each.mjcf_model.model: each for each in self._make_obstacles()}
-        if spec.moves:
-            props.append(Lane("lane", LANE_M, 0.09))
-        self._props = [*props, *self._obstacles.values()]
-        for prop in self._props:
-            cell.add_prop(prop)
+            name = f"thing-{number}"
+            self._kinds[name] = f"{colour} {outline}"
+            self._others.append(name)
+            stickers.append(Sticker(name, outline, colour, size))
+        self._obstacles = Obstacles(spec.n_obstacles, spec.obstacle_height_m, moves=spec.moves)
+        self._props = Props(cell, [*stickers, *self._obstacles.props])
 
-    def _distractors(self) -> list[tuple[str, str]]:
+    def _distractors(self) -> "list[tuple[Shape, str]]":
         """Outline and colour of everything that can be put there to distract, one prop each."""
         spec = self.spec
         if not spec.n_distractors[1]:
@@ -221,32 +210,11 @@ class Clutter(Placing[ClutterSpec, ClutterScenario]):
         count = max(2 * len(kinds), spec.n_distractors[1])
         return [kinds[number % len(kinds)] for number in range(count)]
 
-    def _make_obstacles(self) -> list["Obstacle"]:
-        """One that can move, posts, boxes and an overhang; all of full height."""
-        from hvs_suite.cell.prop import Obstacle
-        from hvs_suite.cell.solid import Solid
-
-        if not self.spec.n_obstacles[1]:
-            return []
-        h = 0.5 * _HEIGHT_M
-        beam = Solid("box", (0.16, 0.03, 0.02), (0.16, 0.0, _HEIGHT_M - 0.02))
-        return [
-            Obstacle("carriage", [Solid("cylinder", (0.035, 0.035, h), (0, 0, h))], _GREYS[0]),
-            Obstacle("post-thin", [Solid("cylinder", (0.02, 0.02, h), (0, 0, h))], _GREYS[1]),
-            Obstacle("post-thick", [Solid("cylinder", (0.04, 0.04, h), (0, 0, h))], _GREYS[2]),
-            Obstacle("box", [Solid("box", (0.05, 0.04, h), (0, 0, h))], _GREYS[2]),
-            Obstacle("wall", [Solid("box", (0.10, 0.015, h), (0, 0, h))], _GREYS[0]),
-            Obstacle("overhang", [Solid("box", (0.025, 0.025, h), (0, 0, h)), beam], _GREYS[1]),
-        ]
-
     def after_compile(self, physics: "mjcf.Physics") -> None:
         """Look up marker and props in the compiled model."""
         super().after_compile(physics)
-        geoms = {prop.mjcf_model.model: physics.bind(prop.geom) for prop in self._props}
-        self._geoms = {name: int(geom.element_id) for name, geom in geoms.items()}
-        bodies = physics.model.body_mocapid[physics.model.geom_bodyid[list(self._geoms.values())]]
-        self._mocaps = dict(zip(self._geoms, bodies.tolist(), strict=True))
-        self._red_geom = self.marker_geom
+        self._props.after_compile(physics)
+        self._disc_geoms = {_MARKER: self.marker_geom, **self._props.geoms}
 
     def draw(self, streams: Streams) -> ClutterScenario:
         """Draw target, start, what lies around, what stands around, and look."""
@@ -260,7 +228,7 @@ class Clutter(Placing[ClutterSpec, ClutterScenario]):
         placed = self._lay_out(streams.generator("things"), colour, goal)
         way, motion = np.zeros((0, 7)), None
         if spec.n_obstacles[1]:
-            way, standing = self._stand_around(streams.generator("obstacles"), start, goal)
+            way, standing = self._obstacles.draw(streams.generator("obstacles"), start, goal)
             placed += standing
         if spec.moves:
             random = streams.generator("motion")
@@ -278,11 +246,11 @@ class Clutter(Placing[ClutterSpec, ClutterScenario]):
     def _lay_out(self, random: np.random.Generator, colour: str, goal: Goal) -> list[Placed]:
         """Lay all that is flat on the ring, each thing at a distance from all others."""
         spec = self.spec
-        things = [f"disc-{each}" for each in spec.colours if each != colour]
-        bank = [name for name in self._geoms if name.startswith("thing-")]
+        things = [_disc(each) for each in spec.colours if each != colour]
         low, high = spec.n_distractors
         count = int(random.integers(low, high + 1))
-        things += [bank[number] for number in random.permutation(len(bank))[:count]]
+        chosen = random.permutation(len(self._others))[:count]
+        things += [self._others[number] for number in chosen]
         middles = [goal.target[:2]]
         for _ in things:
             for _ in range(_MAX_REDRAWS):
@@ -298,123 +266,45 @@ class Clutter(Placing[ClutterSpec, ClutterScenario]):
         yaws = random.uniform(-math.pi, math.pi, len(middles))
         return [
             Placed(name, np.array([*place, 0.0, yaw]))
-            for name, place, yaw in zip([f"disc-{colour}", *things], middles, yaws, strict=True)
+            for name, place, yaw in zip([_disc(colour), *things], middles, yaws, strict=True)
         ]
-
-    def _stand_around(
-        self, random: np.random.Generator, start: FloatArray, goal: Goal
-    ) -> tuple[FloatArray, list[Placed]]:
-        """Put obstacles where a way stays free; the first but the moving one near the target."""
-        from hvs_suite.tasks.shared.room import Room, draw_way
-
-        low, high = self.spec.n_obstacles
-        moving = ["carriage"] * self.spec.moves
-        others = [name for name in self._obstacles if name not in moving]
-        for _ in range(_MAX_REDRAWS):
-            way = draw_way(random, start, goal)
-            room = Room(start, way, goal.target)
-            count = int(random.integers(low, high + 1))
-            names = [*moving, *(others[i] for i in random.permutation(len(others)))][:count]
-            placed = []
-            for number, name in enumerate(names):
-                is_near = number == self.spec.moves
-                found = self._find_room(random, room, name, goal.target, is_near=is_near)
-                placed += [] if found is None else [found]
-            has_all = set(moving) <= {each.prop for each in placed}
-            if len(placed) >= low and has_all:
-                return way, placed
-        raise OptionError(
-            f"no room for {low} obstacles around the way to {goal.target.round(3).tolist()}; lower "
-            "n_obstacles"
-        )
-
-    def _find_room(
-        self,
-        random: np.random.Generator,
-        room: "Room",
-        name: str,
-        target: FloatArray,
-        *,
-        is_near: bool,
-    ) -> Placed | None:
-        """Put an obstacle where it fits: near the target if there is room, or anywhere."""
-        for near in (True, False) if is_near else (False,):
-            for _ in range(_MAX_STANDINGS):
-                placed = Placed(name, self._draw_standing(random, name, target, is_near=near))
-                solids = self._solids(placed, whole_way=True)
-                if room.fits(solids):
-                    room.add(solids)
-                    return placed
-        return None
-
-    def _draw_standing(
-        self, random: np.random.Generator, name: str, target: FloatArray, *, is_near: bool
-    ) -> FloatArray:
-        """Draw where an obstacle stands, (4,): near the target, or anywhere in reach."""
-        low, high = self.spec.obstacle_height_m
-        yaw, away = random.uniform(-math.pi, math.pi, 2)
-        if is_near:
-            distance = random.uniform(0.10, 0.30)
-            x, y = target[:2] + distance * np.array([math.cos(away), math.sin(away)])
-        else:
-            distance = math.sqrt(random.uniform(0.25**2, 0.85**2))
-            x, y = distance * math.cos(away), distance * math.sin(away)
-        if name == "overhang":
-            low = max(low, min(high, 0.35))
-            # It reaches over the target, more or less.
-            yaw = math.atan2(target[1] - y, target[0] - x) + 0.2 * yaw
-        return np.array([x, y, random.uniform(low, high) - _HEIGHT_M, yaw])
-
-    def _solids(self, placed: Placed, *, whole_way: bool) -> list["Solid"]:
-        """What an obstacle is made of where it stands, or all the way that it moves."""
-        *place, yaw = placed.pose.tolist()
-        solids = [solid.moved(place, yaw) for solid in self._obstacles[placed.prop].solids]
-        if placed.prop != "carriage" or not self.spec.moves or not whole_way:
-            return solids
-        way = (LANE_M * math.cos(yaw), LANE_M * math.sin(yaw))
-        return [solid.swept(way) for solid in solids]
 
     def begin(self, physics: "mjcf.Physics", scenario: ClutterScenario) -> None:
         """Put everything where it belongs, and park the rest."""
         import mujoco
 
         from hvs_suite.cell.prop import PARKED_M
+        from hvs_suite.tasks.shared.obstacles import CARRIAGE, LANE
 
         super().begin(physics, scenario)
-        self._goal = Goal(scenario.target, np.array([0.0, 0.0, 1.0]), self.spec.standoff_m)
-        for name in self._mocaps:
-            self._put(physics, name, [*PARKED_M, 0.0])
+        self._goal = self.goal_over(*scenario.target[:2])
+        self._props.park(physics)
+        self.put_marker(physics, Goal(np.array(PARKED_M), self._goal.normal))
         for each in scenario.placed:
-            if each.prop == "disc-red":
+            if each.prop == _MARKER:
                 self.put_marker(physics, self.goal_over(*each.pose[:2]))
             else:
-                self._put(physics, each.prop, each.pose)
-        self.marker_geom = self._geoms.get(f"disc-{scenario.colour}", self._red_geom)
-        self._moving = next((p for p in scenario.placed if p.prop == "carriage"), None)
-        if self._moving is not None and scenario.motion is not None:
-            x, y, _, yaw = self._moving.pose
-            self._put(physics, "lane", [x, y, 0.0, yaw])
+                self._props.put(physics, each)
+        self.marker_geom = self._disc_geoms[_disc(scenario.colour)]
+        self._carriage = next((p for p in scenario.placed if p.prop == CARRIAGE), None)
+        if self._carriage is not None and scenario.motion is not None:
+            lying = np.array([1.0, 1.0, 0.0, 1.0]) * self._carriage.pose
+            self._props.put(physics, Placed(LANE, lying))
         self.advance(physics, 0.0)
         # The picture that follows shows where bodies were computed to be.
         mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)
 
     def advance(self, physics: "mjcf.Physics", time_s: float) -> None:
         """Move the obstacle that moves."""
-        motion, moving = self.scenario.motion, self._moving
-        if motion is None or moving is None:
+        from hvs_suite.tasks.shared.obstacles import LANE_M, moved
+
+        motion = self.scenario.motion
+        if motion is None or self._carriage is None:
             return
         begins_s, speed = motion
-        way = min(max(speed * (time_s - begins_s), 0.0), LANE_M)
-        self._rests = way >= LANE_M
-        x, y, z, yaw = moving.pose
-        pose = [x + way * math.cos(yaw), y + way * math.sin(yaw), z, yaw]
-        self._moved = dataclasses.replace(moving, pose=np.array(pose))
-        self._put(physics, moving.prop, pose)
-
-    def _put(self, physics: "mjcf.Physics", name: str, pose: Sequence[float] | FloatArray) -> None:
-        data, mocap, half = physics.data.ptr, self._mocaps[name], 0.5 * float(pose[3])
-        data.mocap_pos[mocap] = pose[:3]
-        data.mocap_quat[mocap] = [math.cos(half), 0.0, 0.0, math.sin(half)]
+        self._way_m = min(max(speed * (time_s - begins_s), 0.0), LANE_M)
+        self._has_come = self._way_m >= LANE_M
+        self._props.put(physics, moved(self._carriage, self._way_m))
 
     def goal(self, ahead_s: float = 0.0) -> Goal:
         """Over the target, at any time."""
@@ -427,18 +317,18 @@ class Clutter(Placing[ClutterSpec, ClutterScenario]):
 
     def things(self) -> list[tuple[str, FloatArray]]:
         """Colour and outline of what lies on the surface, and where (2,) m; the target first."""
-        flat = [p for p in self.scenario.placed if p.prop not in self._obstacles]
-        return [(_kind(each.prop), each.pose[:2]) for each in flat]
+        return [
+            (self._kinds[each.prop], each.pose[:2])
+            for each in self.scenario.placed
+            if each.prop in self._kinds
+        ]
 
     def obstacles(self) -> tuple["Solid", ...]:
         """All obstacles; the one that moves with all its lane until it rests."""
-        standing = [p for p in self.scenario.placed if p.prop in self._obstacles]
         solids: list[Solid] = []
-        for each in standing:
-            if each is self._moving and self.scenario.motion is not None and self._rests:
-                solids += self._solids(self._moved, whole_way=False)
-            else:
-                solids += self._solids(each, whole_way=True)
+        for each in filter(self._obstacles.is_one, self.scenario.placed):
+            rests = each is self._carriage and self.scenario.motion is not None and self._has_come
+            solids += self._obstacles.solids(each, self._way_m if rests else 0.0)
         return tuple(solids)
 
     @classmethod
@@ -459,9 +349,9 @@ class Clutter(Placing[ClutterSpec, ClutterScenario]):
         ]
 
 
-def _kind(prop: str) -> str:
-    """Outline and colour of a flat prop, without its number."""
-    return prop.split("-", 2)[2] if prop.startswith("thing-") else prop
+def _disc(colour: str) -> str:
+    """Name of the disc of a colour."""
+    return f"disc-{colour}"
 
 
 def _range(numbers: tuple[int, int]) -> str:

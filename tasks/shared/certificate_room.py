@@ -14,7 +14,7 @@ from hvs_suite.cell.robot import JOINT_SPEED_RAD_S
 from hvs_suite.cell.solid import obstacle_distance
 from hvs_suite.tasks.shared.certificate import Check, target_in
 from hvs_suite.tasks.shared.detection import Disc, find_level_disc
-from hvs_suite.tasks.shared.room import APPROACH_M, straight
+from hvs_suite.tasks.shared.room import APPROACH_M, LEAST_CLEARANCE_M, straight
 
 if TYPE_CHECKING:
     from hvs_suite.tasks.shared.environment import Environment
@@ -101,7 +101,7 @@ def check_clear_way(env: "Environment", scenarios: Iterable[int]) -> list[Check]
         often the fastest ways that do not heed the obstacles are blocked.
     """
     spec = env.spec
-    clear_m, steps, seen, hidden, blocked = [], [], [], [], []
+    clear_m, own_m, steps, seen, hidden, blocked = [], [], [], [], [], []
     env.draws = False
     for index in scenarios:
         env.reset(scenario=index)
@@ -110,6 +110,7 @@ def check_clear_way(env: "Environment", scenarios: Iterable[int]) -> list[Check]
         distance = obstacle_distance(env.obstacles)
         legs = [straight(*leg) for leg in itertools.pairwise(stations)]
         clear_m.append(min(distance(q) for leg in legs for q in leg))
+        own_m.append(min(kinematics().clearance(q) for leg in legs for q in leg))
         seconds = sum(
             float(travel_time(here, there[None], acceleration_limits=True)[0])
             for here, there in itertools.pairwise(stations)
@@ -134,6 +135,12 @@ def check_clear_way(env: "Environment", scenarios: Iterable[int]) -> list[Check]
             f"{1000 * min(clear_m):.0f} mm",
             f">= {1000 * CLEAR_M:.0f} mm",
             min(clear_m) >= CLEAR_M,
+        ),
+        Check(
+            "clear: least distance from the surface and between links on that way",
+            f"{1000 * min(own_m):.0f} mm",
+            f">= {1000 * LEAST_CLEARANCE_M:.0f} mm",
+            min(own_m) >= LEAST_CLEARANCE_M,
         ),
         Check(
             "clear: steps of that way, with a stop at each posture",
