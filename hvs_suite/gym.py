@@ -218,7 +218,9 @@ class PixelsAgentPos(gymnasium.Wrapper[Any, Any, Observation, Any]):
                 np.concatenate([box.high for box in boxes]),
                 dtype=np.float32,
             )
-        self._further = tuple(n for n in env.environment.spec.further_observations if n in inner)
+        self._further = tuple(
+            n for n in env.environment.spec.further_observations if n in inner.spaces
+        )
         view |= {name: inner[name] for name in self._further}
         self.observation_space = spaces.Dict(view)
 
