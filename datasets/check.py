@@ -453,7 +453,7 @@ def _check_info(
     if extra:
         wrong.append(f"has features of no recording: {', '.join(extra)}")
     expected = {
-        "fps": round(1.0 / spec.control_period_s),
+        "fps": spec.fps,
         "robot_type": ROBOT_TYPE,
         "total_episodes": len(list(places)),
     }

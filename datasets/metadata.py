@@ -94,9 +94,3 @@ def read_metadata(root: str | Path) -> DatasetMetadata:
         if name not in content:
             raise DatasetError(f"{path} lacks {name!r}; record the dataset again")
     return validated(DatasetMetadata, content, path, error=DatasetError)
-
-
-def jsonable(options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options as JSON gives them back, so that written and fresh ones compare equal."""
-    loaded: dict[str, Any] = json.loads(json.dumps(dict(options), sort_keys=True))
-    return loaded

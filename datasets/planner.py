@@ -17,19 +17,20 @@ A goal that moves is met where it will be, and then followed (see `Planner.follo
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
 import ruckig
 
 from hvs_suite.cell import robot
-from hvs_suite.cell.kinematics import Kinematics, kinematics
+from hvs_suite.cell.kinematics import Kinematics, away_from_stops, kinematics
 from hvs_suite.cell.solid import Solid, obstacle_distance
 from hvs_suite.datasets.roadmap import Roadmap
 from hvs_suite.tasks.shared.goal import Goal
 
 FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
 
 CLEARANCE_M = 0.010
 """Distance that a motion keeps from the surface and between links (m)."""
@@ -47,6 +48,11 @@ TIE_BREAK_S = 0.01
 LEAD_S = 0.025
 """How far the set point runs ahead of the motion (s): a little less than the joints' lag, tuned for
 the fewest steps. More overshoots the goal, less arrives late."""
+
+_CROWDED_SHARE = 0.5
+_ROOM_S = 1.5
+"""Where more goals follow, what a joint at its stop costs (s), against the way back from there; a
+joint within `_CROWDED_SHARE` of its range costs nothing, between the price goes with the square."""
 
 PLAIN_SWIVELS = 1
 """The elbow straight above: two postures within reach, as a rule."""
@@ -68,6 +74,14 @@ _LEVEL = 1.0 - 1e-12
 _MEETINGS = 3
 """How often the time is refined at which a moving goal is met: each round halves the error or
 better, because targets move far slower than the arm."""
+FORESIGHT_S = 7.0
+"""For how long a posture that meets a moving goal should be able to stay with it (s)."""
+_FORESIGHT_STEP_S = 0.5
+_FORESIGHT_SWIVELS = 60
+_FREE_RANGE_RAD = robot.JOINT_RANGE_RAD[:6] - math.radians(8.0)
+"""A posture in which a joint goes beyond this is not one to follow in."""
+_SPEED_SHARE = 0.7
+"""Nor is one that takes more than this share of a joint's speed."""
 _N_ONWARD_SWIVEL = 36
 _ONWARD_SLACK_S = 0.2
 """A posture whose way on takes this much longer than the shortest way on is not chosen."""
@@ -133,6 +147,7 @@ class Planner:
         self._goal_key: bytes = b""
         self._family: FloatArray = np.empty((7, 1))
         """The goal's configurations, one a column; the last is kept free."""
+        self._more_follow = False
         self._floor_m = 0.0
         self._clearance_m = 0.0
         """Of the present state."""
@@ -168,6 +183,7 @@ class Planner:
         """
         self._look_around(q, goal)
         self._remember_goal(goal)
+        self._more_follow = goal.more_follow
         family = self._reachable(q, velocity, goal)
         if onward is not None:
             family = self._with_short_way_on(family, onward)
@@ -210,41 +226,75 @@ class Planner:
         velocity: FloatArray,
         set_point: FloatArray,
         goal_in: Callable[[float], Goal],
+        foresight_s: float = FORESIGHT_S,
     ) -> FloatArray:
         """Where the set point shall be at the end of the control step, to stay with a moving goal.
 
-        Near the goal, the posture nearest to the present one is taken at which the flange is where
-        the goal will be at the end of the control step, and the set point that brings the arm there
-        exactly (`robot.set_point_to_reach`). Where that is too far for one step, the arm heads for
-        the place where it can meet the goal soonest.
+        Near the goal, a posture is taken at which the flange is where the goal will be at the end
+        of the control step, and the set point that brings the arm there exactly
+        (`robot.set_point_to_reach`): the posture nearest to the present one, pushed a little away
+        from the joints' stops, which yaw and elbow are free for. Where that is too far for one
+        step, the arm heads for the place where it can meet the goal soonest, in a posture in which
+        it can stay with it.
 
         Args:
             q: Joint angles now, (7,) rad.
             velocity: Joint velocities now, (7,) rad/s.
             set_point: Now, (7,) rad.
             goal_in: The goal some time from now (s).
+            foresight_s: How far ahead that is worth planning for (s).
 
         Returns:
             (7,) rad.
         """
+        # What was left out for the last answer may be right for this one.
+        self._goal_key = b""
         soon = goal_in(self._period_s)
-        self._remember_goal(soon)
-        posture = self._nearest_posture(q, soon)
-        if posture is not None:
+        for start in (away_from_stops(q), q):
+            posture = self._nearest_posture(start, soon)
+            if posture is None:
+                continue
             led = robot.set_point_to_reach(posture, q, set_point, self._period_s)
             within = np.abs(led - set_point) <= robot.JOINT_SPEED_RAD_S * self._period_s
             if within.all() and (np.abs(led) <= robot.JOINT_RANGE_RAD).all():
                 return led
-        ahead_s = 0.0
+        ahead_s, lasting = 0.0, None
         for _ in range(_MEETINGS):
-            goal = goal_in(ahead_s)
-            self._remember_goal(goal)
-            family = self._reachable(q, velocity, goal)
+            meeting = goal_in(ahead_s)
+            self._remember_goal(meeting, lasting)
+            family = self._reachable(q, velocity, meeting)
             if len(family) == 0:
                 break
             times, _ = stopping_travel_time(q[:6], velocity[:6], family[:, :6])
             ahead_s = float(times.min())
-        return self.next_set_point(q, velocity, goal_in(ahead_s))
+            if lasting is None:
+                moments = np.arange(ahead_s, ahead_s + foresight_s, _FORESIGHT_STEP_S).tolist()
+                lasting = self._lasting([goal_in(moment) for moment in moments])
+        meeting = goal_in(ahead_s)
+        self._remember_goal(meeting, lasting)
+        return self.next_set_point(q, velocity, meeting)
+
+    def _lasting(self, path: Sequence[Goal]) -> BoolArray:
+        """Which rows of `Kinematics.goal_shapes` can be kept along a path: (m,).
+
+        Carried along with elbow and shape as they are, they keep away from the joints' stops and
+        well below their speeds. A7 is left out, because yaw is free. Where the path leaves the
+        reach it ends.
+        """
+        n_swivel = min(self._n_swivel, _FORESIGHT_SWIVELS)
+        lasts: BoolArray = np.ones(8 * n_swivel, bool)
+        fastest = _SPEED_SHARE * _FORESIGHT_STEP_S * robot.JOINT_SPEED_RAD_S[:6]
+        before: FloatArray | None = None
+        for goal in path:
+            shapes = self._kinematics.goal_shapes(goal.position, goal.normal, n_swivel)[:, :6]
+            if len(shapes) == 0:
+                break
+            lasts &= (np.abs(shapes) <= _FREE_RANGE_RAD).all(axis=1)
+            if before is not None:
+                lasts &= (np.abs(shapes - before) <= fastest).all(axis=1)
+            before = shapes
+        # What holds for an elbow place holds for those within a few degrees of it.
+        return lasts.repeat(self._n_swivel // n_swivel)
 
     def _look_around(self, q: FloatArray, goal: Goal) -> None:
         """Take in how far the arm is from what it must not touch."""
@@ -278,17 +328,29 @@ class Planner:
         for node in roadmap.candidates(times + TIE_BREAK_S * effort):
             yield np.append(node[:6], last)
 
-    def _remember_goal(self, goal: Goal) -> None:
-        """Computes the goal's family of configurations once a goal."""
+    def _remember_goal(self, goal: Goal, among: BoolArray | None = None) -> None:
+        """Computes the goal's family of configurations once a goal.
+
+        Args:
+            goal: Where the flange has to be.
+            among: Rows of `Kinematics.goal_shapes` (m,) to choose among where one is in range.
+        """
         key = goal.position.tobytes() + goal.normal.tobytes()
-        if key != self._goal_key:
-            self._goal_key = key
-            self._soonest_s = math.inf
+        if key == self._goal_key and among is None:
+            return
+        self._goal_key = key
+        self._soonest_s = math.inf
+        family: FloatArray = np.empty((0, 7))
+        if among is not None:
+            shapes = self._kinematics.goal_shapes(goal.position, goal.normal, self._n_swivel)
+            family = shapes[among] if len(shapes) else shapes
+            family = family[(np.abs(family[:, :6]) <= robot.JOINT_RANGE_RAD[:6]).all(axis=1)]
+        if len(family) == 0:
             family = self._kinematics.goal_configurations_at_tool_angle(
                 goal.position, goal.normal, tool_angle=0.0, n_swivel=self._n_swivel
             )
-            self._family = np.empty((7, len(family) + 1))
-            self._family[:, :-1] = family.T
+        self._family = np.empty((7, len(family) + 1))
+        self._family[:, :-1] = family.T
 
     def _with_short_way_on(self, family: FloatArray, onward: Goal) -> FloatArray:
         """The configurations (m, 7) of a family from which the next goal is soon reached."""
@@ -324,7 +386,7 @@ class Planner:
 
         def price(goals: FloatArray) -> FloatArray:
             times, effort = _stopping_travel_time(q[:6], velocity[:6], goals)
-            return times + TIE_BREAK_S * effort
+            return times + TIE_BREAK_S * effort + (_crowding(goals) if self._more_follow else 0.0)
 
         bound = (np.abs(joints - q[:6, None]) / _FULL_SPEED).max(axis=0)
         [listed] = np.nonzero(bound <= self._soonest_s)
@@ -468,6 +530,13 @@ class Planner:
             clearance = self._clearance(q)
             least = min(least, clearance)
         return least
+
+
+def _crowding(postures: FloatArray) -> FloatArray:
+    """What postures (6, m) without A7 cost for joints near their stops, (m,) s."""
+    share = np.abs(postures) / robot.JOINT_RANGE_RAD[:6, None]
+    crowded = np.clip((share - _CROWDED_SHARE) / (1.0 - _CROWDED_SHARE), 0.0, 1.0)
+    return np.asarray(_ROOM_S * (crowded**2).sum(axis=0))
 
 
 def _where_braking_ends(q: FloatArray, velocity: FloatArray) -> FloatArray:

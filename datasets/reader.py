@@ -182,6 +182,24 @@ def read_places(root: Path) -> list[Place]:
     return list(places.values())
 
 
+def data_files(root: Path) -> list[Path]:
+    """Tabular files of a dataset, in frame order.
+
+    Args:
+        root: The dataset.
+
+    Returns:
+        The files.
+
+    Raises:
+        DatasetError: There are none.
+    """
+    files = sorted((root / "data").glob("chunk-*/file-*.parquet"))
+    if not files:
+        raise DatasetError(f"{root} holds no data/chunk-*/file-*.parquet; record it first")
+    return files
+
+
 def read_table(root: Path, name: str, columns: list[str] | None = None) -> pa.Table:
     """Reads one parquet file.
 

@@ -11,26 +11,27 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hvs_suite.datasets.features import dataset_features
 from hvs_suite.datasets.metadata import (
     METADATA_FILE,
     DatasetMetadata,
-    jsonable,
     read_metadata,
     write_metadata,
 )
 from hvs_suite.errors import DatasetError, HvsError, OptionError, OutputError, ScenarioError
 from hvs_suite.names import check_name
-from hvs_suite.registry import find
+from hvs_suite.registry import find, options_of
 from hvs_suite.rollout import play
 from hvs_suite.tasks.shared.lock import digest
+from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
+
+if TYPE_CHECKING:
+    from hvs_suite.datasets.writer import DatasetWriter
 
 BLOCK_EPISODES = 50
 """Episodes between two publications: what a kill can cost."""
-TEST_SPLIT = "test"
-TEST_SCENARIOS = 1000
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -91,8 +92,7 @@ def record(
         UnknownTaskError: There is no such task.
         OptionError: An option or a number makes no sense.
         ScenarioError: The split holds fewer scenarios.
-        OutputError: ``out`` is not empty without ``resume``, cannot be written, or another process
-            records into it.
+        OutputError: ``out`` is not empty without ``resume``, cannot be written, or is in use.
         DatasetError: What ``resume`` found was recorded otherwise.
     """
     spec = find(task).with_options(dict(options or {}))
@@ -103,7 +103,7 @@ def record(
         task=task,
         task_version=spec.version,
         split=split,
-        options=jsonable(options or {}),
+        options=options_of(spec),
         noise=float(noise),
         command=command,
         task_digest=digest(task),
@@ -116,49 +116,66 @@ def record(
     if resume:
         _check_same_recording(root, metadata)
     missing = [folder for folder in (root, *root.parents) if not folder.exists()]
-    with taken(root, resume=resume):
+    with taken(root, resume=resume), _removed_if_empty(missing):
         outcomes = published_outcomes(root)
         tracker = _Tracker(len(outcomes), sum(outcomes), episodes, progress)
-        fps = round(1.0 / spec.control_period_s)
-        writer = DatasetWriter(root, features, fps, block)
+        writer = DatasetWriter(root, features, spec.fps, block)
         played = play(
-            MakeEnvironment(task, split, dict(options or {})),
+            MakeEnvironment(task, split, metadata.options),
             make_demonstrator,
             range(len(outcomes), episodes),
             Demonstrate(noise),
             workers=workers,
         )
-        try:
-            try:
-                with contextlib.closing(played):
-                    for demonstration in in_order(played, len(outcomes)):
-                        # Not before there is something to keep: see below.
-                        if tracker.frames == 0:
-                            write_metadata(root, metadata)
-                        writer.save(demonstration)
-                        tracker.saved(demonstration.length, demonstration.success)
-            except (KeyboardInterrupt, HvsError):
-                writer.publish()
-                raise
-            writer.publish()
-        except OSError as error:
-            if isinstance(error, HvsError):
-                raise
-            writer.discard()
-            saved = len(published_outcomes(root))
-            if not saved:
-                # The same command begins anew, with or without --resume.
-                (root / METADATA_FILE).unlink(missing_ok=True)
-            raise OutputError(
-                f"cannot write {root}: {error.strerror or error}; {saved} of {episodes} episodes "
-                "are saved, go on with --resume"
-            ) from error
-        finally:
-            # A recording that could not begin, for want of OpenGL say, leaves no trace.
-            for folder in missing:
-                with contextlib.suppress(OSError):
-                    folder.rmdir()
+        with _publishing(writer, root, episodes), contextlib.closing(played):
+            for demonstration in in_order(played, len(outcomes)):
+                # Not before there is something to keep: see `_removed_if_empty`.
+                if tracker.frames == 0:
+                    write_metadata(root, metadata)
+                writer.save(demonstration)
+                tracker.saved(demonstration.length, demonstration.success)
     return tracker.state()
+
+
+@contextlib.contextmanager
+def _removed_if_empty(folders: Iterable[Path]) -> Iterator[None]:
+    """A recording that could not begin, for want of OpenGL say, leaves no trace."""
+    try:
+        yield
+    finally:
+        for folder in folders:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+
+
+@contextlib.contextmanager
+def _publishing(writer: "DatasetWriter", root: Path, episodes: int) -> Iterator[None]:
+    """Publishes what was saved, however the recording ends.
+
+    Raises:
+        OutputError: There is no room, or no right to write.
+    """
+    from hvs_suite.datasets.writer import published_outcomes
+
+    try:
+        try:
+            yield
+        except (KeyboardInterrupt, HvsError):
+            writer.publish()
+            raise
+        writer.publish()
+    except OSError as error:
+        if isinstance(error, HvsError):
+            raise
+        writer.discard()
+        saved = len(published_outcomes(root))
+        if not saved:
+            # The same command begins anew, with or without --resume.
+            (root / METADATA_FILE).unlink(missing_ok=True)
+        raise OutputError(
+            f"cannot write {root}: {error.strerror or error}; {saved} of {episodes} episodes "
+            "are saved, go on with --resume"
+        ) from error
 
 
 def in_order[T: Any](demonstrations: Iterable[T], first: int) -> Iterator[T]:

@@ -6,7 +6,7 @@ Run as ``python eval/leaderboard.py`` or ``hvs leaderboard``. Results lie as
 reason: a board is only as good as its worst row.
 
 Equal results give equal bytes, on any machine, as long as ``clips`` stays beside the board. What
-was played again once is not played again on the same machine; see `board_replays`.
+was played again once is not played again on the same machine; see `replay_check`.
 """
 
 import argparse
@@ -16,9 +16,9 @@ from pathlib import Path
 
 from hvs_suite import files
 from hvs_suite.errors import HvsError, OptionError
-from hvs_suite.eval import board_clips, board_replays, board_reruns, submission
-from hvs_suite.eval.board_page import page
-from hvs_suite.eval.board_tables import make_entries, markdown
+from hvs_suite.eval.board import clips, replay_check, rerun_check, submission
+from hvs_suite.eval.board.page import page
+from hvs_suite.eval.board.tables import make_entries, markdown
 from hvs_suite.names import shown
 
 RESULTS = Path("eval/results")
@@ -29,7 +29,7 @@ def build(
     results_folder: Path = RESULTS,
     out: Path = OUT,
     *,
-    replay: int = board_replays.SAMPLE,
+    replay: int = replay_check.SAMPLE,
     reruns: Path | None = None,
     ledger: Path | None = None,
     draft: bool = False,
@@ -43,8 +43,8 @@ def build(
         replay: Scenarios of each new result to play again, drawn anew; a number that a result does
             not have plays all of it.
         reruns: Folder of the maintainers' own results on an unseen split, laid out likewise; see
-            `board_reruns`.
-        ledger: Where this machine remembers what it played; `board_replays.own_ledger` by default.
+            `rerun_check`.
+        ledger: Where this machine remembers what it played; `replay_check.own_ledger` by default.
         draft: Show what is no score yet, and say so on the board; see `submission.check`.
         say: Told what takes time.
 
@@ -57,18 +57,18 @@ def build(
         OutputError: A file cannot be written.
         RenderError: A clip is to be drawn and nothing here can.
     """
-    ledger = board_replays.own_ledger() if ledger is None else ledger
+    ledger = replay_check.own_ledger() if ledger is None else ledger
     if ledger.resolve().is_relative_to(results_folder.resolve()):
         raise OptionError(f"{ledger} lies among the results; what was played is noted elsewhere")
     submissions = submission.check(results_folder, draft=draft)
     written = out / "LEADERBOARD.md", out / "leaderboard.html"
     for path in written:
         files.check_writable(path)
-    replays = board_replays.check(submissions, ledger, sample=replay, say=say)
-    rerun = {} if reruns is None else board_reruns.check(submissions, reruns)
+    replays = replay_check.check(submissions, ledger, sample=replay, say=say)
+    rerun = {} if reruns is None else rerun_check.check(submissions, reruns)
     entries = make_entries(submissions, replays, rerun)
-    clips = board_clips.clips(submissions, out / board_clips.FOLDER, say)
-    texts = markdown(entries, draft=draft), page(entries, clips, draft=draft)
+    films = clips.clips(submissions, out / clips.FOLDER, say)
+    texts = markdown(entries, draft=draft), page(entries, films, draft=draft)
     for path, text in zip(written, texts, strict=True):
         with files.replacing(path) as temporary:
             temporary.write_text(text, encoding="utf-8", newline="\n")
@@ -90,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--replay",
         type=int,
-        default=board_replays.SAMPLE,
+        default=replay_check.SAMPLE,
         help="scenarios of each new result to play again; 1000 plays all (default: %(default)s)",
     )
     parser.add_argument("--reruns", type=Path, help="folder of the maintainers' own re-runs")

@@ -73,7 +73,7 @@ class TaskEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
         self._environment.clip_actions = True
         self.render_mode = render_mode
         spec = self._environment.spec
-        self.metadata = {**self.metadata, "render_fps": round(1.0 / spec.control_period_s)}
+        self.metadata = {**self.metadata, "render_fps": spec.fps}
         self.task = spec.name
         specification = self._environment.observation_spec()
         self._spaces: dict[str, spaces.Space[Any]] = {

@@ -25,8 +25,8 @@ _INVISIBLE = (
 )
 # Small letters and digits that pass for Latin ones; what NFKC and casefold leave of look-alikes.
 _LOOK_ALIKES = str.maketrans(
-    "аɑαсϲԁеєεһհ1lіıιмηոп0оοօрρг5ѕтτиυսѵνхχᴢζ",
-    "aaaccdeeehhiiiiimnnnoooopprssttuuuvvxxzz",
+    "аɑαсϲԁеєεһհ1lіıιмηոп0оοօрρг5ѕтτиυսѵνхχᴢζ×ᴀᴅᴇꜰɪᴍɴᴏᴘʀꜱᴛᴜᴠ",
+    "aaaccdeeehhiiiiimnnnoooopprssttuuuvvxxzzxadefimnoprstuv",
 )
 
 
@@ -69,14 +69,14 @@ def shown(text: str) -> str:
 
 
 def look_alike(name: str, names: Iterable[str]) -> str | None:
-    """Find the name that another one is, or passes for.
+    """Find which of some names another one is, or passes for.
 
     Case, accents, punctuation, widths, and letters of other alphabets that look the same make no
     difference.
 
     Args:
         name: A stranger's name.
-        names: Names of ours, in plain ASCII.
+        names: Those it may not pass for.
 
     Returns:
         The first that it looks like; None if it looks like none.
@@ -93,4 +93,4 @@ def _is_seen(character: str) -> bool:
 def _skeleton(name: str) -> str:
     # Compatibility first, casefold after it, and apart once more what casefold has put together.
     folded = unicodedata.normalize("NFKD", unicodedata.normalize("NFKC", name).casefold())
-    return "".join(c for c in folded if c.isalnum()).translate(_LOOK_ALIKES)
+    return "".join(c for c in folded.translate(_LOOK_ALIKES) if c.isalnum())

@@ -182,7 +182,6 @@ def read_npz(
     *,
     most: int,
     error: type[HvsError],
-    within: Path | None = None,
 ) -> dict[str, npt.NDArray[Any]]:
     """Read named arrays of an ``npz`` file whose unpacked size is bounded.
 
@@ -191,13 +190,12 @@ def read_npz(
         arrays: Type and number of dimensions of each array that must be in it; others are refused.
         most: Largest size allowed, packed and unpacked (bytes).
         error: Raised where it is not such a file.
-        within: As in `check_regular`.
 
     Raises:
         HvsError: As `error`: not a zip, encrypted, of another compression, damaged, too large, or
             with other arrays.
     """
-    content = read_bytes(path, most=most, error=error, within=within)
+    content = read_bytes(path, most=most, error=error)
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             members = {

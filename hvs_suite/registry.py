@@ -4,8 +4,10 @@ The suite's own families are imported here, the only place above ``tasks`` that 
 other packages are found by their entry points (see `hvs_suite.tasks.shared.family`).
 """
 
+import dataclasses
 import difflib
 import functools
+import json
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -56,6 +58,29 @@ def find(name: str) -> Spec:
     close = difflib.get_close_matches(str(name), TASKS, n=3, cutoff=0.5)
     hint = f"did you mean {' or '.join(close)}?" if close else f"choose from {', '.join(TASKS)}"
     raise UnknownTaskError(f"unknown task {name!r}; {hint}")
+
+
+def options_of(spec: Spec) -> dict[str, Any]:
+    """The options by which a spec differs from the task that it is named after.
+
+    Args:
+        spec: Parameters, of a named task or changed from one.
+
+    Returns:
+        Values by name, as JSON gives them back, so that written and fresh ones compare equal; empty
+        for the task as named.
+
+    Raises:
+        UnknownTaskError: The spec's name is not registered.
+    """
+    named = find(spec.name)
+    options = {
+        field.name: getattr(spec, field.name)
+        for field in dataclasses.fields(spec)
+        if getattr(spec, field.name) != getattr(named, field.name)
+    }
+    found: dict[str, Any] = json.loads(json.dumps(options))
+    return found
 
 
 def family_of(name: str) -> type[family.Family[Any, Any]]:

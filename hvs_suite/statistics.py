@@ -10,13 +10,17 @@ import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 
+CONFIDENCE = 0.95
+"""Coverage that all intervals aim at."""
 N_RESAMPLES = 1000
 """Bootstrap resamples: the ends of a 95 % interval come from 25 of them each."""
 # Resampled values held in memory at once.
 _CHUNK = 1 << 20
 
 
-def wilson_interval(n_success: int, n_total: int, confidence: float = 0.95) -> tuple[float, float]:
+def wilson_interval(
+    n_success: int, n_total: int, confidence: float = CONFIDENCE
+) -> tuple[float, float]:
     """Returns Wilson's score interval for a success rate, without continuity correction.
 
     With p = n_success / n_total and z the normal quantile of (1 + confidence) / 2:
@@ -40,7 +44,8 @@ def wilson_interval(n_success: int, n_total: int, confidence: float = 0.95) -> t
     """
     if not 0 <= n_success <= n_total or n_total < 1:
         raise ValueError(f"{n_success} successes in {n_total} trials are not possible.")
-    _check_confidence(confidence)
+    if not 0.0 < confidence < 1.0:
+        raise ValueError(f"confidence must lie between 0 and 1, not {confidence}.")
     z = statistics.NormalDist().inv_cdf(0.5 + confidence / 2)
     rate = n_success / n_total
     centre = rate + z**2 / (2 * n_total)
@@ -53,9 +58,7 @@ def wilson_interval(n_success: int, n_total: int, confidence: float = 0.95) -> t
 
 
 def mean_rate_interval(
-    counts: Sequence[tuple[int, int]],
-    confidence: float = 0.95,
-    weights: Sequence[float] | None = None,
+    counts: Sequence[tuple[int, int]], weights: Sequence[float] | None = None
 ) -> tuple[float, float]:
     """Returns an interval for a weighted mean of independent success rates.
 
@@ -68,7 +71,6 @@ def mean_rate_interval(
 
     Args:
         counts: Successes and trials of each rate, one or more.
-        confidence: Coverage aimed at, in (0, 1).
         weights: One for each rate; 1 / k by default. Less than 1 in all where rates that are
             missing count as 0 %.
 
@@ -76,13 +78,12 @@ def mean_rate_interval(
         Lower and upper end (percent).
 
     Raises:
-        ValueError: There is no rate, counts are not those of trials, or `confidence` is outside
-            (0, 1).
+        ValueError: There is no rate, or counts are not those of trials.
     """
     if not counts:
         raise ValueError("Give one or more rates.")
     rates = [100 * n_success / n_total for n_success, n_total in counts]
-    intervals = [wilson_interval(*count, confidence) for count in counts]
+    intervals = [wilson_interval(*count) for count in counts]
     shares = [1.0 / len(rates)] * len(rates) if weights is None else list(weights)
     weighed = list(zip(shares, rates, intervals, strict=True))
     mean = math.fsum(w * p for w, p, _ in weighed)
@@ -126,13 +127,13 @@ def percentile(values: npt.ArrayLike, percent: float) -> float:
 
 
 def interquartile_mean_interval(
-    strata: Sequence[npt.ArrayLike], confidence: float = 0.95, resamples: int = N_RESAMPLES
+    strata: Sequence[npt.ArrayLike], resamples: int = N_RESAMPLES
 ) -> tuple[float, float]:
     """Returns the stratified bootstrap interval of the interquartile mean.
 
     Each stratum (the episodes of one task) is resampled with replacement on its own, so that every
     resample holds as many episodes of each task as the data; the interquartile mean is then taken
-    over all of them together. The interval holds the middle `confidence` of these means. The same
+    over all of them together. The interval holds the middle 95 % of these means. The same
     values give the same interval, always.
 
     Source: B. Efron, "Bootstrap methods: another look at the jackknife", Annals of Statistics 7
@@ -140,16 +141,14 @@ def interquartile_mean_interval(
 
     Args:
         strata: One or more (n_k,), in any unit; a single task is a single stratum.
-        confidence: Coverage aimed at, in (0, 1).
         resamples: Number of resamples.
 
     Returns:
         Lower and upper end, in the unit of the values.
 
     Raises:
-        ValueError: A stratum is empty, there is none, or `confidence` is outside (0, 1).
+        ValueError: A stratum is empty, or there is none.
     """
-    _check_confidence(confidence)
     if not strata:
         raise ValueError("Give one or more strata.")
     columns = [_vector(values) for values in strata]
@@ -163,7 +162,7 @@ def interquartile_mean_interval(
             for indices in _resampled([len(values) for values in columns], resamples)
         ]
     )
-    return _middle(means, confidence)
+    return _middle(means)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,12 +182,7 @@ class Difference:
     n: int
 
 
-def paired_difference(
-    first: npt.ArrayLike,
-    second: npt.ArrayLike,
-    confidence: float = 0.95,
-    resamples: int = N_RESAMPLES,
-) -> Difference:
+def paired_difference(first: npt.ArrayLike, second: npt.ArrayLike) -> Difference:
     """Returns the mean paired difference with its bootstrap interval.
 
     Scenarios are resampled, not values: both policies' values of a scenario stay together, so what
@@ -200,21 +194,18 @@ def paired_difference(
     Args:
         first: (n,) of the first policy, by scenario.
         second: (n,) of the second, the same scenarios in the same order.
-        confidence: Coverage aimed at, in (0, 1).
-        resamples: Number of resamples.
 
     Raises:
-        ValueError: The lengths differ or are 0, or `confidence` is outside (0, 1).
+        ValueError: The lengths differ or are 0.
     """
-    _check_confidence(confidence)
     ours, theirs = _vector(first), _vector(second)
     if ours.shape != theirs.shape:
         raise ValueError(f"Pairs need equal lengths, not {len(ours)} and {len(theirs)}.")
     differences = ours - theirs
     means = np.concatenate(
-        [differences[index].mean(axis=1) for (index,) in _resampled([len(ours)], resamples)]
+        [differences[index].mean(axis=1) for (index,) in _resampled([len(ours)], N_RESAMPLES)]
     )
-    low, high = _middle(means, confidence)
+    low, high = _middle(means)
     return Difference(float(differences.mean()), low, high, len(ours))
 
 
@@ -358,14 +349,9 @@ def _resampled(lengths: Sequence[int], resamples: int) -> Iterator[list[npt.NDAr
         ]
 
 
-def _middle(values: FloatArray, confidence: float) -> tuple[float, float]:
-    low, high = np.percentile(values, [50 - 50 * confidence, 50 + 50 * confidence])
+def _middle(values: FloatArray) -> tuple[float, float]:
+    low, high = np.percentile(values, [50 - 50 * CONFIDENCE, 50 + 50 * CONFIDENCE])
     return float(low), float(high)
-
-
-def _check_confidence(confidence: float) -> None:
-    if not 0.0 < confidence < 1.0:
-        raise ValueError(f"confidence must lie between 0 and 1, not {confidence}.")
 
 
 def _vector(values: npt.ArrayLike) -> FloatArray:

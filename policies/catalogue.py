@@ -1,21 +1,28 @@
 """Finds policies by name: baselines, shipped weights, a checkpoint here or on the Hub, own code."""
 
 import difflib
+import os
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 from hvs_suite.errors import PolicyError
-from hvs_suite.policies import hub, imported
+from hvs_suite.policies import imported
+from hvs_suite.policies.checkpoints import hub
 from hvs_suite.policies.recipe import trained_on
 from hvs_suite.registry import find
 from hvs_suite.rollout import PolicyFactory
+from hvs_suite.tasks.shared.spec import Spec
 
 BUILTIN = ("expert", "servo", "zero", "random")
 SHIPPED = ("pretrained", "finetuned")
 NAMES = (*BUILTIN, *SHIPPED)
 HERE = Path(__file__).resolve().parent
+AS_NAMED: Mapping[str, Any] = MappingProxyType({})
 
 
-def policy_factory(spec: str, task: str) -> PolicyFactory:
+def policy_factory(spec: str, task: str, options: Mapping[str, Any] = AS_NAMED) -> PolicyFactory:
     """Find a policy for a task.
 
     Args:
@@ -24,6 +31,7 @@ def policy_factory(spec: str, task: str) -> PolicyFactory:
             (``owner/name``), or ``module:factory`` for code of one's own, which is imported and run
             once the policy is built (see `hvs_suite.policies.imported`).
         task: Named task.
+        options: Options that it is played with, where they differ from it.
 
     Returns:
         Builds the policy for an environment; pickles, so that workers can build their own.
@@ -31,13 +39,14 @@ def policy_factory(spec: str, task: str) -> PolicyFactory:
     Raises:
         PolicyError: There is no such policy, it cannot be loaded, or it does not fit the task.
         UnknownTaskError: There is no such task.
+        OptionError: An option does not exist or its value makes no sense.
     """
-    find(task)
+    played = find(task).with_options(options)
     if spec in BUILTIN:
         return _builtin(spec)
     if imported.NAME.fullmatch(spec):
         return imported.imported_factory(spec)
-    return _checkpoint(checkpoint_folder(spec, task), task)
+    return _checkpoint(checkpoint_folder(spec, task), played)
 
 
 def checkpoint_folder(spec: str, task: str) -> Path:
@@ -58,7 +67,8 @@ def checkpoint_folder(spec: str, task: str) -> Path:
                 f"this version ships no {spec} weights for {task}; train your own with {command}"
             )
         return folder
-    if Path(spec).is_dir():
+    # Unlike pathlib's, this is just False for a name that cannot be.
+    if os.path.isdir(spec):
         return Path(spec)
     if hub.NAME.fullmatch(spec):
         return hub.fetch(spec)
@@ -98,15 +108,15 @@ def _builtin(name: str) -> PolicyFactory:
     return builtin.make_zero if name == "zero" else builtin.make_random
 
 
-def _checkpoint(folder: Path, task: str) -> PolicyFactory:
+def _checkpoint(folder: Path, task: Spec) -> PolicyFactory:
     """Check a checkpoint here and now, before workers are started for it."""
     try:
-        from hvs_suite.policies import checkpoint, checkpoint_files
+        from hvs_suite.policies.checkpoints import files, loading
         from hvs_suite.policies.sac import playing
     except ImportError as error:
         raise PolicyError(f"playing {folder} needs torch; install hvs-suite[learn]") from error
     if playing.is_sac(folder):
-        playing.check_fit(playing.read_config(folder), folder, find(task))
+        playing.check_fit(playing.read_config(folder), folder, task)
         return playing.SacFactory(str(folder.resolve()))
-    checkpoint.check_fit(checkpoint_files.read_config(folder), folder, find(task))
-    return checkpoint.CheckpointFactory(str(folder.resolve()))
+    loading.check_fit(files.read_config(folder), folder, task)
+    return loading.CheckpointFactory(str(folder.resolve()))

@@ -2,7 +2,7 @@
 
 Importing the module runs its code with all the rights of whoever evaluates it. Nothing in the suite
 does so unless that name was typed on the command line or passed to `policy_factory`; a score is
-played in a process apart (see `hvs_suite.eval.policy_process`).
+played in a process apart (see `hvs_suite.eval.serving.policy_process`).
 """
 
 import dataclasses

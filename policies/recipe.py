@@ -13,6 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from hvs_suite import registry
+from hvs_suite.errors import OptionError
 
 HERE = Path(__file__).resolve().parent
 DATASET_RECIPES = HERE.parent / "datasets" / "recipes"
@@ -57,9 +58,15 @@ def recipe(task: str) -> Recipe:
 
     Raises:
         UnknownTaskError: There is no such task.
+        OptionError: The suite ships no policy of it.
     """
     registry.find(task)
     name = trained_on(task)
+    if not (HERE / "recipes" / f"{name}.json").is_file():
+        raise OptionError(
+            f"the suite ships no policy of {task}, so there is none to make again; record and "
+            "pretrain one yourself"
+        )
     recorded, learned = (
         json.loads((folder / f"{name}.json").read_text())
         for folder in (DATASET_RECIPES, HERE / "recipes")

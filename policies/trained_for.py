@@ -7,7 +7,6 @@ family ``align``, at 0.1 s, without options.
 """
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,7 +16,8 @@ import pydantic
 from hvs_suite.errors import PolicyError
 from hvs_suite.names import shown
 from hvs_suite.reading import validated
-from hvs_suite.registry import find
+from hvs_suite.registry import options_of
+from hvs_suite.tasks.shared.option_types import listed
 from hvs_suite.tasks.shared.spec import Disturbances, Spec
 
 FAMILY = "align"
@@ -76,17 +76,8 @@ def trained_for(spec: Spec) -> TrainedFor:
     Args:
         spec: Parameters of the task, its options included.
     """
-    named = find(spec.name)
-    options = {
-        field.name: getattr(spec, field.name)
-        for field in dataclasses.fields(spec)
-        if getattr(spec, field.name) != getattr(named, field.name)
-    }
     return TrainedFor(
-        family=spec.family,
-        control_period_s=spec.control_period_s,
-        # As JSON gives them back, so that written and fresh ones compare equal.
-        options=json.loads(json.dumps(options)),
+        family=spec.family, control_period_s=spec.control_period_s, options=options_of(spec)
     )
 
 
@@ -127,7 +118,7 @@ def check_trained_for(config: Mapping[str, Any], folder: Path, spec: Spec) -> No
     if differing:
         raise PolicyError(
             f"{mismatch} with {_in_words(before, differing)}, the task is played with "
-            f"{_in_words(now, differing)}; load the task with the options of the training"
+            f"{_in_words(now, differing)}; play it with the options of the training"
         )
 
 
@@ -142,6 +133,6 @@ def _binding(options: Mapping[str, Any]) -> dict[str, Any]:
 
 def _in_words(options: Mapping[str, Any], names: list[str]) -> str:
     words = (
-        f"{name}={options[name]!r}" if name in options else f"{name} as named" for name in names
+        listed({name: options[name]}) if name in options else f"{name} as named" for name in names
     )
     return shown(", ".join(words)[:_MOST_WORDS])

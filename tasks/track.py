@@ -18,7 +18,8 @@ from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared.family import Progress, register
 from hvs_suite.tasks.shared.goal import POSITION, TILT, Goal
 from hvs_suite.tasks.shared.metric import Metric
-from hvs_suite.tasks.shared.placing import UP, Placing, PlacingSpec
+from hvs_suite.tasks.shared.motion import Motion, draw_curve, draw_line
+from hvs_suite.tasks.shared.placing import HARD, UP, Placing, PlacingSpec
 from hvs_suite.tasks.shared.scenario import Scenario, Streams, draw_look
 from hvs_suite.tasks.shared.spec import Description, scene
 
@@ -37,8 +38,6 @@ TIME_INSIDE = "time_inside_pc"
 
 SETTLING_STEPS = 20
 """Control steps at the beginning that do not count for the share of time inside."""
-_N_SINES = 3
-_FREQUENCY_HZ = (0.05, 0.45)
 _MAX_REDRAWS = 10_000
 _CHECK_PERIOD_S = 0.1
 """How often along a motion its place, speed and acceleration are looked at (s)."""
@@ -118,43 +117,6 @@ class TrackSpec(PlacingSpec):
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class Motion:
-    """A motion: ``centre + velocity t + sum of amplitude sin(omega t + phase)``.
-
-    Attributes:
-        centre: (2,) m, base frame.
-        velocity: (2,) m/s; zero on a curve.
-        amplitude: (3, 2) m; zero on a line.
-        omega: (3, 2) rad/s.
-        phase: (3, 2) rad.
-    """
-
-    centre: FloatArray
-    velocity: FloatArray
-    amplitude: FloatArray
-    omega: FloatArray
-    phase: FloatArray
-
-    def place(self, time_s: npt.ArrayLike) -> FloatArray:
-        """Where the target is at times (...,) s: (..., 2) m."""
-        time = np.asarray(time_s, np.float64)[..., None]
-        return np.asarray(self.centre + self.velocity * time + self._waves(np.sin, time, 0))
-
-    def speed(self, time_s: npt.ArrayLike) -> FloatArray:
-        """How fast it moves at times (...,) s: (..., 2) m/s."""
-        time = np.asarray(time_s, np.float64)[..., None]
-        return np.asarray(self.velocity + self._waves(np.cos, time, 1))
-
-    def acceleration(self, time_s: npt.ArrayLike) -> FloatArray:
-        """How fast that changes at times (...,) s: (..., 2) m/s^2."""
-        return -self._waves(np.sin, np.asarray(time_s, np.float64)[..., None], 2)
-
-    def _waves(self, wave: np.ufunc, time: FloatArray, derivative: int) -> FloatArray:
-        height: FloatArray = self.amplitude * self.omega**derivative
-        return np.asarray((height * wave(self.omega * time[..., None] + self.phase)).sum(axis=-2))
-
-
-@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class TrackScenario(Scenario):
     """One scene.
 
@@ -185,12 +147,15 @@ class Track(Placing[TrackSpec, TrackScenario]):
         """Draw motions until one stays on the ring for the whole episode."""
         spec, random = self.spec, streams.generator("motion")
         fastest = random.uniform(*spec.speed_m_s)
-        times: FloatArray = _CHECK_PERIOD_S * np.arange(round(spec.motion_s / _CHECK_PERIOD_S) + 1)
+        n_times = round(spec.motion_s / _CHECK_PERIOD_S) + 1
+        times = _CHECK_PERIOD_S * np.arange(n_times, dtype=np.float64)
         for _ in range(_MAX_REDRAWS):
             if spec.motion == "line":
-                motion = self._line(random, fastest)
+                motion = draw_line(random, self.draw_on_ring, fastest)
             else:
-                motion = self._curve(random, fastest, times)
+                motion = draw_curve(
+                    random, self.draw_on_ring, fastest, spec.acceleration_m_s2, times
+                )
             radius = np.hypot(*motion.place(times).T)
             if spec.ring_m[0] <= radius.min() and radius.max() <= spec.ring_m[1]:
                 return motion
@@ -198,33 +163,6 @@ class Track(Placing[TrackSpec, TrackScenario]):
             f"no motion of {spec.motion_s:g} s at {fastest:.2f} m/s found that stays on the ring; "
             "lower speed_m_s or motion_s"
         )
-
-    def _line(self, random: np.random.Generator, fastest: float) -> Motion:
-        heading = random.uniform(-np.pi, np.pi)
-        none = np.zeros((_N_SINES, 2))
-        return Motion(
-            centre=np.array(self.draw_on_ring(random)),
-            velocity=fastest * np.array([np.cos(heading), np.sin(heading)]),
-            amplitude=none,
-            omega=none,
-            phase=none,
-        )
-
-    def _curve(self, random: np.random.Generator, fastest: float, times: FloatArray) -> Motion:
-        """Sines of random weight, scaled so that neither speed nor acceleration is exceeded."""
-        omega = 2.0 * np.pi * random.uniform(*_FREQUENCY_HZ, (_N_SINES, 2))
-        wild = Motion(
-            centre=np.array(self.draw_on_ring(random)),
-            velocity=np.zeros(2),
-            # Slow sines sway farther at the same speed.
-            amplitude=random.normal(size=(_N_SINES, 2)) / omega,
-            omega=omega,
-            phase=random.uniform(-np.pi, np.pi, (_N_SINES, 2)),
-        )
-        speed = np.linalg.norm(wild.speed(times), axis=1).max()
-        acceleration = np.linalg.norm(wild.acceleration(times), axis=1).max()
-        tame = min(fastest / speed, self.spec.acceleration_m_s2 / acceleration)
-        return dataclasses.replace(wild, amplitude=tame * wild.amplitude)
 
     def begin(self, physics: "mjcf.Physics", scenario: TrackScenario) -> None:
         """Lay the marker where it starts."""
@@ -302,4 +240,16 @@ register(
     Track,
     _LINE,
     dataclasses.replace(_LINE, name="track-curve", motion="curve"),
+    dataclasses.replace(
+        _LINE,
+        name="track-hard",
+        motion="curve",
+        start="random",
+        target_diameter_m=0.020,
+        tilt_tolerance_deg=0.5,
+        time_limit_steps=80,
+        motion_s=8.0,
+        latency_steps=1,
+        **HARD,
+    ),
 )

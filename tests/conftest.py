@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 import hvs_suite
+import hvs_suite.cell  # chooses the OpenGL backend before a test module imports MuJoCo
 
 if TYPE_CHECKING:
     from hvs_suite.tasks.shared.environment import Environment

@@ -6,8 +6,9 @@ from typing import Any
 from dm_control import composer, mjcf
 
 from hvs_suite.cell import cameras
+from hvs_suite.cell.arm import Iiwa7
 from hvs_suite.cell.marker import Marker
-from hvs_suite.cell.robot import PHYSICS_TIMESTEP_S, Iiwa7
+from hvs_suite.cell.robot import PHYSICS_TIMESTEP_S
 from hvs_suite.cell.surface import Surface
 
 

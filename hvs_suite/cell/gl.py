@@ -52,12 +52,12 @@ class GLContext:
 
     def make_current(self) -> None:
         """Direct the calling thread's OpenGL calls to this context."""
-        _strike_dm_control_off()
+        strike_dm_control_off()
         self._context.make_current()
 
     def free(self) -> None:
         """Give the context back; none is current in the calling thread after that."""
-        _strike_dm_control_off()
+        strike_dm_control_off()
         self._context.free()
 
 
@@ -131,7 +131,7 @@ def create_context(width: int, height: int) -> GLContext:
     return context
 
 
-def _strike_dm_control_off() -> None:
+def strike_dm_control_off() -> None:
     """Have dm_control make its context current again before it next draws in this thread."""
     # Only now: importing it fixes the backend, which a context of ours has chosen.
     from dm_control._render import base

@@ -15,6 +15,7 @@ import numpy.typing as npt
 import pinocchio as pin
 
 from hvs_suite.cell import robot
+from hvs_suite.errors import OutputError
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -23,6 +24,8 @@ _SHOULDER = np.array([0.0, 0.0, robot.BASE_TO_SHOULDER_M])
 _SINGULAR = 1e-9
 """Below this sine of A2 or A6 the two axes beside it coincide."""
 _ITERATIONS = 8
+_DRIFT_RANGE_RAD = np.radians(30.0)
+_DRIFT_RAD = 0.05
 _OFTEN_NEAREST = 4, 7
 """Links that come nearest to each other in most configurations: forearm and hand."""
 # A shape and its mirror image through each of the three pivots: adding pi to the two roll joints
@@ -45,6 +48,17 @@ def _branches() -> tuple[FloatArray, FloatArray]:
 
 
 _BRANCH_SHIFT, _BRANCH_SIGN = _branches()
+
+
+def away_from_stops(q: FloatArray) -> FloatArray:
+    """Joint angles (7,) in rad with those near their stops pushed back a little.
+
+    The nearest configuration of a goal to these drifts, as far as the goal leaves joints free, from
+    one control step to the next. A joint at its stop is pushed by `_DRIFT_RAD`, less the farther
+    away it is, and not at all from `_DRIFT_RANGE_RAD` on.
+    """
+    near = 1.0 - (robot.JOINT_RANGE_RAD - np.abs(q)) / _DRIFT_RANGE_RAD
+    return np.asarray(q - _DRIFT_RAD * np.sign(q) * np.clip(near, 0.0, 1.0))
 
 
 def _wrap(angle: FloatArray) -> FloatArray:
@@ -120,15 +134,26 @@ class Kinematics:
     """Pinocchio's view of the cell's robot; configurations are (7,) in rad, A1 to A7.
 
     Not for use by several threads at once: Pinocchio's buffers are shared between calls.
+
+    Raises:
+        OutputError: There is no room for a temporary file.
     """
 
     def __init__(self) -> None:
         # Pinocchio reads MJCF from a file only.
-        with tempfile.TemporaryDirectory() as folder:
-            path = pathlib.Path(folder, "iiwa7.xml")
-            path.write_text(robot.robot_mjcf(), encoding="utf-8")
-            self.model = pin.buildModelFromMJCF(str(path))
-            self.geometry = pin.buildGeomFromMJCF(self.model, str(path), pin.GeometryType.COLLISION)
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                path = pathlib.Path(folder, "iiwa7.xml")
+                path.write_text(robot.robot_mjcf(), encoding="utf-8")
+                self.model = pin.buildModelFromMJCF(str(path))
+                self.geometry = pin.buildGeomFromMJCF(
+                    self.model, str(path), pin.GeometryType.COLLISION
+                )
+        except OSError as error:
+            raise OutputError(
+                f"cannot write a temporary file of 10 kB: {error.strerror}; make room, or name "
+                "another folder in TMPDIR"
+            ) from error
         if self.model.nq != len(robot.JOINT_NAMES):
             raise RuntimeError("Pinocchio read no robot from the cell's MJCF")
         self._flange = self.model.getFrameId("flange")
@@ -331,6 +356,22 @@ class Kinematics:
         q = self._shapes(position, normal, _circle(n_swivel))
         q[:, 6] = tool_angle
         return _within_ranges(q)
+
+    def goal_shapes(
+        self, position: npt.ArrayLike, normal: npt.ArrayLike, n_swivel: int
+    ) -> FloatArray:
+        """The family of a goal at yaw 0, row by row the same elbow places and shapes for any goal.
+
+        Args:
+            position: Flange face centre (3,) in m.
+            normal: Outward surface normal (3,).
+            n_swivel: Evenly spaced elbow places over the circle.
+
+        Returns:
+            (8 n_swivel, 7) in rad, joint ranges not checked, angles within [-pi, pi); empty where
+            the goal is out of reach.
+        """
+        return self._shapes(position, normal, _circle(n_swivel))
 
     def nearest_configuration(
         self, q: FloatArray, position: FloatArray, normal: FloatArray, weight: FloatArray

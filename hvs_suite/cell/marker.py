@@ -4,6 +4,7 @@ A marker is a mocap body, so moving it changes the state and not the compiled mo
 contacts and lies a quarter of a millimetre proud of the surface.
 """
 
+import functools
 from typing import Any, Literal
 
 import cv2
@@ -107,8 +108,15 @@ class Marker(composer.Entity):
 
 def orientation(normal: FloatArray) -> FloatArray:
     """Quaternion (4,) w x y z that turns a marker's z axis to a surface's outward normal (3,)."""
+    return _orientation(*normal.tolist())
+
+
+# A target that moves over a plane keeps its normal, and is asked for in every control step.
+@functools.lru_cache(maxsize=16)
+def _orientation(x: float, y: float, z: float) -> FloatArray:
     quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, tool_frame(-normal).ravel())
+    mujoco.mju_mat2Quat(quat, tool_frame(np.array([-x, -y, -z])).ravel())
+    quat.setflags(write=False)
     return quat
 
 

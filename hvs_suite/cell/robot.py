@@ -1,8 +1,8 @@
-"""The KUKA LBR iiwa 7 R800 as a composer entity: chain, inertia, joint control, collision bodies.
+"""The KUKA LBR iiwa 7 R800: chain, inertia, joint control, collision bodies.
 
 One description serves MuJoCo and Pinocchio: :func:`robot_mjcf` is the bare text that both load, and
-:class:`Iiwa7` is the same tree with visual shells. Frames: the base frame stands on the mounting
-plane with z up; at the zero pose every link frame is parallel to it.
+`hvs_suite.cell.arm.Iiwa7` is the same tree with visual shells. Frames: the base frame stands on the
+mounting plane with z up; at the zero pose every link frame is parallel to it.
 
 Contact bits (two geoms meet if the contype of one shares a bit with the conaffinity of the other;
 links less than three apart, counting the base, never meet and are excluded):
@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from dm_control import composer, mjcf
+from dm_control import mjcf
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -273,7 +273,7 @@ def _add_inertial(body: Any, link: _Link) -> None:
     body.add("inertial", mass=link.mass, pos=link.centre, fullinertia=link.inertia)
 
 
-def _robot_tree() -> mjcf.RootElement:
+def robot_tree() -> mjcf.RootElement:
     """Builds the bare robot: bodies, joints, actuators, collision geoms and the flange site."""
     root = mjcf.RootElement(model="iiwa7")
     root.compiler.angle = "radian"
@@ -334,66 +334,4 @@ def _robot_tree() -> mjcf.RootElement:
 
 def robot_mjcf() -> str:
     """The bare robot (no shells, no assets) as MJCF text that MuJoCo and Pinocchio both load."""
-    return str(_robot_tree().to_xml_string())
-
-
-class Iiwa7(composer.Entity):
-    """The arm as a composer entity; its model origin is the base frame.
-
-    The gains are tuned for ``PHYSICS_TIMESTEP_S`` and ``implicitfast``: the model that it is
-    attached to has to set both. At every reset set ``physics.bind(robot.actuators).act`` to the
-    joint positions: MuJoCo's default of 0 would throw the arm.
-    """
-
-    def _build(self, shells: bool = True) -> None:
-        """Builds the model.
-
-        Args:
-            shells: Add the visual shells; without them only collision geoms (hidden) exist.
-        """
-        self._root = _robot_tree()
-        self._shell_geoms: tuple[Any, ...] = ()
-        if shells:
-            from hvs_suite.cell import shells as shells_module
-
-            self._shell_geoms = shells_module.add_shells(self._root)
-
-    @property
-    def mjcf_model(self) -> mjcf.RootElement:
-        """Root of the robot's MJCF tree."""
-        return self._root
-
-    @property
-    def joints(self) -> tuple[Any, ...]:
-        """The joints A1 to A7."""
-        return tuple(self._root.find("joint", name) for name in JOINT_NAMES)
-
-    @property
-    def actuators(self) -> tuple[Any, ...]:
-        """The ``intvelocity`` actuators A1 to A7: control is a set-point speed (rad/s)."""
-        return tuple(self._root.find("actuator", name) for name in JOINT_NAMES)
-
-    @property
-    def flange(self) -> Any:
-        """Site at the flange face centre, +z out along the tool axis."""
-        return self._root.find("site", "flange")
-
-    @property
-    def flange_body(self) -> Any:
-        """Link 7, which carries the flange."""
-        return self._root.find("body", "link_7")
-
-    @property
-    def base_body(self) -> Any:
-        """The base link, standing on the mounting plane."""
-        return self._root.find("body", "base")
-
-    @property
-    def collision_geoms(self) -> tuple[Any, ...]:
-        """All collision geoms, base included."""
-        return tuple(g for g in self._root.find_all("geom") if str(g.name).find("collision") >= 0)
-
-    @property
-    def shell_geoms(self) -> tuple[Any, ...]:
-        """The visual geoms; empty without shells."""
-        return self._shell_geoms
+    return str(robot_tree().to_xml_string())

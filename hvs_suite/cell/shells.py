@@ -91,7 +91,6 @@ def _turned(
     profile: list[tuple[float, float]],
     axis: Literal["y", "z"] = "z",
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    sides: int = _N_SIDES,
 ) -> trimesh.Trimesh:
     """A solid of revolution.
 
@@ -99,9 +98,8 @@ def _turned(
         profile: (radius, height along the axis) in m, from one pole to the other.
         axis: Axis of revolution.
         centre: Origin of the axis.
-        sides: Corners of each circle.
     """
-    mesh = trimesh.creation.revolve(np.array(profile), sections=sides)
+    mesh = trimesh.creation.revolve(np.array(profile), sections=_N_SIDES)
     if axis == "y":
         turn = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
         mesh.apply_transform(turn)

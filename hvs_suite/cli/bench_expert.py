@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,11 +34,12 @@ LABELS = {
 }
 
 
-def expert_figures(task: str, episodes: int) -> dict[str, float]:
+def expert_figures(task: str, options: Mapping[str, Any], episodes: int) -> dict[str, float]:
     """Plays test scenarios with the expert, without cameras.
 
     Args:
         task: A named task.
+        options: Options of it.
         episodes: Test scenarios to play, from 0 on.
 
     Returns:
@@ -51,7 +53,7 @@ def expert_figures(task: str, episodes: int) -> dict[str, float]:
     bounds: list[tuple[float, float, int, int]] = []
     collisions = 0
     with (
-        hvs_suite.load(task, split=SPLIT, observations="state") as env,
+        hvs_suite.load(task, split=SPLIT, **{**options, "observations": "state"}) as env,
         console.progress(f"expert on {task}", episodes) as advance,
     ):
         expert = Timed(make_expert(env))

@@ -2,12 +2,14 @@
 
 import tempfile
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from hvs_suite.cli import console
-from hvs_suite.cli.bench import two_worker_rate
+from hvs_suite.cli.bench_simulation import two_worker_rate
 
 WORKERS = 2
 
@@ -19,11 +21,14 @@ LABELS = {
 }
 
 
-def recording_figures(task: str, episodes: int, seconds: float) -> dict[str, float]:
+def recording_figures(
+    task: str, options: Mapping[str, Any], episodes: int, seconds: float
+) -> dict[str, float]:
     """Records a dataset that is thrown away, between two measurements of bare simulation.
 
     Args:
         task: A named task.
+        options: Options of it.
         episodes: Episodes to record.
         seconds: How long to simulate, before and after together (s).
 
@@ -34,7 +39,7 @@ def recording_figures(task: str, episodes: int, seconds: float) -> dict[str, flo
     """
     from hvs_suite.datasets.recorder import Progress, record
 
-    before = two_worker_rate(task, seconds / 2)
+    before = two_worker_rate(task, options, seconds / 2)
     told: list[tuple[float, int]] = []
     with tempfile.TemporaryDirectory(prefix="hvs-bench-") as folder, console.meter() as update:
 
@@ -42,8 +47,9 @@ def recording_figures(task: str, episodes: int, seconds: float) -> dict[str, flo
             told.append((time.perf_counter(), state.frames))
             update("recording", state.episodes / state.total, f"{state.episodes_per_s:.1f}/s")
 
-        record(task, episodes, "train", Path(folder) / "bench", workers=WORKERS, progress=progress)
-    after = two_worker_rate(task, seconds / 2)
+        out = Path(folder) / "bench"
+        record(task, episodes, "train", out, options, workers=WORKERS, progress=progress)
+    after = two_worker_rate(task, options, seconds / 2)
     (started, first), (ended, last) = told[0], told[-1]
     rate = (last - first) / (ended - started)
     simulated = float(np.mean([before, after]))

@@ -2,8 +2,8 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Iterator
-from typing import TYPE_CHECKING, Annotated
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -23,48 +23,59 @@ class Certify:
 
     For maintainers, after changing what a task means and raising its version. Refuses a task that
     means something else than the lock says at the same version. Where a check does not hold,
-    nothing of that task is written, and the exit code is 1.
+    nothing of that task is written, and the exit code is 1. Of tasks that another package
+    registers, and of those that options change, the certificate is only printed.
 
     Attributes:
-        tasks: Named tasks; all of them by default. Entries of other tasks stay as they are.
+        tasks: Named tasks; all of the suite's own by default. Entries of other tasks stay as they
+            are.
         workers: Processes that play the expert.
+        option: Parameter of the tasks to change for a study, such as target_diameter_m=0.03; give
+            it several times for several.
     """
 
     tasks: Annotated[
         tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[TASK ...]")
     ] = ()
     workers: int = 1
+    option: tuple[str, ...] = ()
 
     def run(self) -> int:
         """Certify the tasks one after the other, and print what was found."""
         import hvs_suite
         from hvs_suite.registry import family_of, find
         from hvs_suite.tasks.shared import certificate, lock
+        from hvs_suite.tasks.shared.option_types import listed
         from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
 
         if self.workers < 1:
             raise OptionError(f"--workers must be at least 1, not {self.workers}")
-        names = [find(task).name for task in dict.fromkeys(self.tasks or hvs_suite.TASKS)]
+        asked = self.tasks or filter(lock.is_own, hvs_suite.TASKS)
+        options = {task: find(task).options_from_text(self.option) for task in asked}
         # All are held against the lock first: certifying takes minutes a task.
-        entries = {}
-        for name in names:
-            with hvs_suite.load(name, split=TEST_SPLIT) as env:
-                entries[name] = lock.agreed_entry(env)
+        entries: dict[str, lock.LockEntry | None] = {}
+        for task in options:
+            entries[task] = None
+            if lock.is_own(task) and not options[task]:
+                with hvs_suite.load(task, split=TEST_SPLIT) as env:
+                    entries[task] = lock.agreed_entry(env)
         failed = False
         for task, entry in entries.items():
             n = (family_of(task).certificate_passes + 1) * TEST_SCENARIOS
+            digest = lock.digest(task) if entry is None else entry.digest
             with console.progress(f"certify {task}", n) as advance:
-                found = certify(task, entry.digest, TEST_SCENARIOS, self.workers, advance)
+                found = certify(task, options[task], digest, TEST_SCENARIOS, self.workers, advance)
+            changed = listed(options[task])
             console.print_table(
-                (title(found), "found", "needed", ""),
+                (title(found) + (f", with {changed}" if changed else ""), "found", "needed", ""),
                 [(c.what, c.found, c.needed, verdict(c)) for c in found.checks],
             )
             if not found.holds:
                 failed = True
                 print(f"{task}: a check fails; certificate and lock are left as they were")
-                continue
-            certificate.store(found)
-            lock.store(task, entry)
+            elif entry is not None:
+                certificate.store(found)
+                lock.store(task, entry)
         return FAILED if failed else 0
 
 
@@ -82,12 +93,18 @@ class _Counted:
 
 
 def certify(
-    task: str, digest: str, scenarios: int, workers: int, on_scenario: Callable[[], None]
+    task: str,
+    options: Mapping[str, Any],
+    digest: str,
+    scenarios: int,
+    workers: int,
+    on_scenario: Callable[[], None],
 ) -> "Certificate":
     """Answer all four questions for a task.
 
     Args:
         task: Registered name.
+        options: Options that change it; empty for what is to be locked.
         digest: What it means now, as it will stand in the lock.
         scenarios: How many test scenarios, from 0 up.
         workers: Processes that play the expert.
@@ -107,10 +124,12 @@ def certify(
 
     indices = range(scenarios)
     counted = _Counted(indices, on_scenario)
-    with hvs_suite.load(task, split=TEST_SPLIT) as env:
+    with hvs_suite.load(task, split=TEST_SPLIT, **options) as env:
         checks = family_of(task).certify(env, counted)
     episodes = rollout(
-        functools.partial(hvs_suite.load, task, split=TEST_SPLIT, observations="state"),
+        functools.partial(
+            hvs_suite.load, task, split=TEST_SPLIT, **{**options, "observations": "state"}
+        ),
         make_expert,
         indices,
         workers=workers,

@@ -29,7 +29,7 @@ class Compare:
 
     def run(self) -> int:
         """Compare, print a table and one sentence."""
-        from hvs_suite.eval import comparison
+        from hvs_suite.eval.scoring import comparison
 
         found = comparison.compare(self.first, self.second)
         if self.json:

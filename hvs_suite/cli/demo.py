@@ -102,7 +102,7 @@ class Demo:
 
     def _report(self, result: Path, board: Path, times_s: dict[str, float]) -> None:
         """Print the policy's success as it is, where everything lies, and what it took."""
-        from hvs_suite.eval import result_file
+        from hvs_suite.eval.scoring import result_file
 
         summary = result_file.load(result).summary
         low, high = summary.pc_success_ci95
@@ -124,7 +124,7 @@ class Demo:
 
 def _solved_scenario(result: Path) -> int:
     """The first scenario of a result that was solved, 0 if none was."""
-    from hvs_suite.eval import result_file
+    from hvs_suite.eval.scoring import result_file
 
     rows = result_file.load(result).episodes
     return next((row.scenario for row in rows if row.success), 0)

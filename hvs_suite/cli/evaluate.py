@@ -2,16 +2,17 @@
 
 import dataclasses
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hvs_suite.cli import console
 from hvs_suite.errors import OptionError
 
 if TYPE_CHECKING:
-    from hvs_suite.eval.contender import Contender
-    from hvs_suite.eval.result_file import Result
-    from hvs_suite.eval.trial import Trial
+    from hvs_suite.eval.scoring.contender import Contender
+    from hvs_suite.eval.scoring.result_file import Result
+    from hvs_suite.eval.scoring.trial import Trial
     from hvs_suite.tasks.shared.metric import Metric
 
 # The first few say what is wrong; a thousand of the same hide it.
@@ -37,6 +38,8 @@ class Evaluate:
         workers: Processes that share the work; the result is the same for any number.
         decision_limit: Time after which a decision loses its episode (s).
         server: Address of a policy server, such as ws://127.0.0.1:8765; 'hvs serve' starts one.
+        option: Parameter of the task to change for a study, such as target_diameter_m=0.03; give it
+            several times for several. The result says so, and is no score then.
     """
 
     task: tuple[str, ...]
@@ -47,11 +50,12 @@ class Evaluate:
     workers: int = 1
     decision_limit: float = 10.0
     server: str | None = None
+    option: tuple[str, ...] = ()
 
     def run(self) -> int:
         """Evaluate, write the results, print their summaries."""
         from hvs_suite import files, registry
-        from hvs_suite.eval import trial
+        from hvs_suite.eval.scoring import trial
 
         if not self.task:
             raise OptionError("name a --task; 'hvs tasks' lists them")
@@ -60,27 +64,31 @@ class Evaluate:
         paths = (
             [self.out] if len(self.task) == 1 else [self.out / f"{task}.json" for task in self.task]
         )
-        for task, path in zip(self.task, paths, strict=True):
-            registry.find(task)
+        options = [registry.find(task).options_from_text(self.option) for task in self.task]
+        for path in paths:
             files.check_writable(path)
         trial.check_decision_limit(self.decision_limit)
         # Every policy is found before the first is played.
-        contenders = [self._find(task) for task in self.task]
-        for task, path, contender in zip(self.task, paths, contenders, strict=True):
-            _print_summary(self._evaluate(task, path, contender))
+        contenders = list(map(self._find, self.task, options))
+        for task, path, contender, changed in zip(
+            self.task, paths, contenders, options, strict=True
+        ):
+            _print_summary(self._evaluate(task, path, contender, changed))
             print(f"Written to {path}")
         return 0
 
-    def _find(self, task: str) -> "Contender":
-        from hvs_suite.eval import contender
+    def _find(self, task: str, options: Mapping[str, Any]) -> "Contender":
+        from hvs_suite.eval.scoring import contender
 
         if self.server is None:
-            return contender.find(self.policy, task)
-        from hvs_suite.eval import remote_policy
+            return contender.find(self.policy, task, options)
+        from hvs_suite.eval.serving import remote_policy
 
-        return remote_policy.find(self.server, self.policy, task, self.decision_limit)
+        return remote_policy.find(self.server, self.policy, task, self.decision_limit, options)
 
-    def _evaluate(self, task: str, path: Path, contender: "Contender") -> "Result":
+    def _evaluate(
+        self, task: str, path: Path, contender: "Contender", options: Mapping[str, Any]
+    ) -> "Result":
         from hvs_suite.eval import protocol
 
         n_played = n_success = n_failure = 0
@@ -103,6 +111,7 @@ class Evaluate:
                 path,
                 split=self.split,
                 episodes=self.episodes,
+                options=options,
                 workers=self.workers,
                 decision_limit_s=self.decision_limit,
                 progress=note,
@@ -112,10 +121,12 @@ class Evaluate:
 def _print_summary(result: "Result") -> None:
     """Print the numbers of a result as a table."""
     from hvs_suite.registry import find
+    from hvs_suite.tasks.shared.option_types import listed
 
     summary = result.summary
     low, high = summary.pc_success_ci95
     to_goal = summary.steps_to_goal_mean
+    options = result.metadata.options
     spec, errors, settled = find(summary.task), summary.errors, summary.settled
     sharpest = settled.sharpest_95.scale
     console.print_table(
@@ -151,7 +162,8 @@ def _print_summary(result: "Result") -> None:
             ),
             ("control steps a second", f"{result.timings.steps_per_s:.0f}"),
         ],
-        title=f"{summary.policy} on {summary.task}, split {summary.split}",
+        title=f"{summary.policy} on {summary.task}, split {summary.split}"
+        + (f", with {listed(options)}: no score" if options else ""),
     )
 
 

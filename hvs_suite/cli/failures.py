@@ -1,6 +1,7 @@
 """``hvs failures``: why a policy fails, sorted by cause, with pictures."""
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,7 +32,8 @@ class Failures:
 
     def run(self) -> None:
         """Play, sort, draw and print."""
-        from hvs_suite.eval import failures, result_file
+        from hvs_suite.eval.scoring import result_file
+        from hvs_suite.eval.studies import failures
         from hvs_suite.files import check_writable, replacing
 
         if not self.results:
@@ -42,8 +44,9 @@ class Failures:
             check_writable(self.out / "failures.md")
         reports = []
         for path in self.results:
-            summary = result_file.load(path).summary
-            checkpoint = self._checkpoint(summary.task)
+            result = result_file.load(path)
+            summary = result.summary
+            checkpoint = self._checkpoint(summary.task, result.metadata.options)
             lost = summary.n_episodes - summary.n_success
             with console.progress(f"{summary.policy} on {summary.task}", lost) as advance:
                 report = failures.sort_failures(path, checkpoint, advance)
@@ -56,13 +59,13 @@ class Failures:
                 temporary.write_text(text, encoding="utf-8")
         print(text, end="")
 
-    def _checkpoint(self, task: str) -> Path | None:
+    def _checkpoint(self, task: str, options: Mapping[str, Any]) -> Path | None:
         """Folder of the policy, if one is named."""
         from hvs_suite.policies.catalogue import policy_factory
 
         if self.policy is None:
             return None
-        folder = getattr(policy_factory(self.policy, task), "folder", None)
+        folder = getattr(policy_factory(self.policy, task, options), "folder", None)
         if folder is None:
             raise OptionError(f"{self.policy} has no network to ask; name a checkpoint")
         return Path(folder)
@@ -70,13 +73,14 @@ class Failures:
     def _draw(self, out: Path, path: Path, report: Any, checkpoint: Path) -> None:
         """What the cameras showed and where the policy looked, for the first of each cause."""
         import hvs_suite
-        from hvs_suite.eval import action_log, failures, result_file
+        from hvs_suite.eval.scoring import action_log, result_file
+        from hvs_suite.eval.studies import failures
+        from hvs_suite.eval.studies.attention import draw_attention
         from hvs_suite.files import replacing
-        from hvs_suite.policies.attention import draw_attention
 
         result = result_file.load(path)
         log = action_log.load(result_file.actions_path(path), result.metadata.actions_sha256)
-        with hvs_suite.load(report.task, split=report.split) as env:
+        with hvs_suite.load(report.task, split=report.split, **report.options) as env:
             for cause in failures.Cause:
                 for failure in report.of(cause)[: self.pictures]:
                     player = failures.LoggedPolicy(list(log[failure.scenario][: failure.steps]))

@@ -44,6 +44,8 @@ class Finetune:
             critics learn alone.
         eval_every: Environment steps between evaluations; one more comes at start and end.
         eval_episodes: Episodes an evaluation, on scenes of a split of their own.
+        option: Parameter of the task to change for a study, such as target_diameter_m=0.03; give it
+            several times for several.
     """
 
     policy: str
@@ -67,6 +69,7 @@ class Finetune:
     updates: int = 20
     eval_every: int = 10_000
     eval_episodes: int = 100
+    option: tuple[str, ...] = ()
 
     def run(self) -> None:
         """Train, showing how it goes, and say what came of it."""
@@ -88,7 +91,7 @@ class Finetune:
             lost_share=self.lost_share,
             updates=self.updates,
         )
-        registry.find(self.task)
+        options = registry.find(self.task).options_from_text(self.option)
         base = checkpoint_folder(self.policy, self.task)
         from hvs_suite.policies.finetune.training import finetune
 
@@ -99,6 +102,7 @@ class Finetune:
             steps=self.steps,
             seed=self.seed,
             settings=settings,
+            options=options,
             curriculum=self.curriculum,
             eval_every=self.eval_every,
             eval_episodes=self.eval_episodes,

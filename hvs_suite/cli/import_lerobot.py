@@ -31,7 +31,7 @@ class ImportLerobot:
 
     def run(self) -> int:
         """Import the file and print what it claims."""
-        from hvs_suite.eval import lerobot_import
+        from hvs_suite.eval.scoring import lerobot_import
 
         result = lerobot_import.read(
             self.file, task=self.task, policy=self.policy, split=self.split, seed=self.seed

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from hvs_suite.cli import console
 
 if TYPE_CHECKING:
-    from hvs_suite.policies.pretrain import Progress
+    from hvs_suite.policies.imitation.pretrain import Progress
 
 
 DEFAULT_MINUTES = 10.0
@@ -60,7 +60,7 @@ class Pretrain:
 
     def run(self) -> None:
         """Train, showing how it goes, and say where the checkpoint is."""
-        from hvs_suite.policies.pretrain import pretrain
+        from hvs_suite.policies.imitation.pretrain import pretrain
 
         minutes = self.minutes
         if minutes is None and self.steps is None:

@@ -29,6 +29,8 @@ class Record:
         noise: Standard deviation of a disturbance of the executed joint targets, far from the goal
             (rad); the expert's own action stays the label.
         workers: Processes that play episodes.
+        option: Parameter of the task to change for a study, such as target_diameter_m=0.03; give it
+            several times for several. The dataset says so, and is not one of the named task then.
     """
 
     task: str
@@ -39,18 +41,22 @@ class Record:
     start: Literal["zero", "random", "near_goal", "mixed"] | None = None
     noise: float = 0.0
     workers: int = 1
+    option: tuple[str, ...] = ()
 
     def run(self) -> None:
         """Record, showing how it goes, and say what was recorded."""
+        from hvs_suite import registry
         from hvs_suite.datasets.recorder import record
 
+        start = () if self.start is None else (f"start={self.start}",)
+        options = registry.find(self.task).options_from_text((*start, *self.option))
         with console.meter() as update:
             done = record(
                 self.task,
                 self.episodes,
                 self.split,
                 self.out,
-                {} if self.start is None else {"start": self.start},
+                options,
                 workers=self.workers,
                 noise=self.noise,
                 resume=self.resume,

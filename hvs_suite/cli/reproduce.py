@@ -28,7 +28,7 @@ class Reproduce:
     def run(self) -> None:
         """Run the stages, and print what they came to and what they took."""
         from hvs_suite.cli.main import parse
-        from hvs_suite.eval.submission import EPISODES
+        from hvs_suite.eval.board.submission import EPISODES
         from hvs_suite.policies.recipe import recipe
         from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS
 

@@ -29,7 +29,7 @@ class Serve:
         """Serve; prints the address on a line of its own once it listens."""
         if not 0 <= self.port < 2**16:
             raise OptionError(f"--port is {self.port}; use 0 to 65535")
-        from hvs_suite.eval import policy_server
+        from hvs_suite.eval.serving import policy_server
 
         tasks = _tasks(self.policy)
         signal.signal(signal.SIGTERM, _interrupt)
@@ -49,7 +49,7 @@ def _tasks(policy: str) -> list[str]:
     Raises:
         PolicyError: There are none.
     """
-    from hvs_suite.eval import contender
+    from hvs_suite.eval.scoring import contender
     from hvs_suite.registry import TASKS
 
     contender.check_public(policy)

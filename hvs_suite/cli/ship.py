@@ -36,8 +36,8 @@ class Ship:
     def run(self) -> None:
         """Describe it and hand it over."""
         from hvs_suite.datasets.publication import check_repository
-        from hvs_suite.eval import result_file
-        from hvs_suite.policies import card, checkpoint_files, hub
+        from hvs_suite.eval.scoring import result_file
+        from hvs_suite.policies.checkpoints import card, files, hub
 
         if self.to_folder is None and self.to_hub is None:
             raise OptionError("say where to: --to-folder DIR or --to-hub user/name")
@@ -51,6 +51,6 @@ class Ship:
         card.write_card(folder, results, self.command)
         print(f"wrote {folder / card.CARD}")
         if self.to_hub is not None:
-            files = (card.CARD, *checkpoint_files.FILES, *card.TRAINING_FILES)
-            hub.push(folder, self.to_hub, files, private=self.private)
+            names = (card.CARD, *files.FILES, *card.TRAINING_FILES)
+            hub.push(folder, self.to_hub, names, private=self.private)
             print(f"pushed to {self.to_hub}")

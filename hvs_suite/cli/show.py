@@ -29,38 +29,47 @@ INK, FAINT, RULE, PASS, FAIL = "#1e2024", "#6e7278", "#d8d9d6", "#16803c", "#be1
 class Show:
     """Draw a task: cell and both camera images at start and goal, and its certificate.
 
-    The certificate is also printed.
+    The certificate is also printed. Tasks that another package registers, and those that options
+    change, have none.
 
     Attributes:
         task: A named task, such as align-thesis.
         out: Picture to write (.png).
         scenario: Index of the test scenario to draw.
+        option: Parameter of the task to change for a study, such as target_diameter_m=0.03; give it
+            several times for several.
     """
 
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
     out: Path
     scenario: int = 0
+    option: tuple[str, ...] = ()
 
     def run(self) -> None:
         """Draw the picture and print the certificate."""
         import hvs_suite
         from hvs_suite.errors import OutputError
         from hvs_suite.files import check_writable, replacing
+        from hvs_suite.registry import find
+        from hvs_suite.tasks.shared import lock
         from hvs_suite.tasks.shared.certificate import load_certificate
 
         if self.out.suffix.lower() != ".png":
             raise OutputError(f"{self.out} must end in .png")
         check_writable(self.out)
-        with hvs_suite.load(self.task, split="test") as env:
-            certificate = load_certificate(self.task)
+        options = find(self.task).options_from_text(self.option)
+        has_one = lock.is_own(self.task) and not options
+        certificate = load_certificate(self.task) if has_one else None
+        with hvs_suite.load(self.task, split="test", **options) as env:
             start, goal = look(env, self.scenario)
             figure = draw(env.spec, self.scenario, start, goal, certificate)
         with replacing(self.out) as temporary:
             figure.savefig(temporary, dpi=DPI, facecolor="white")
-        console.print_table(
-            (title(certificate), "found", "needed", ""),
-            [(c.what, c.found, c.needed, verdict(c)) for c in certificate.checks],
-        )
+        if certificate is not None:
+            console.print_table(
+                (title(certificate), "found", "needed", ""),
+                [(c.what, c.found, c.needed, verdict(c)) for c in certificate.checks],
+            )
         print(f"wrote {self.out}")
 
 
@@ -108,7 +117,7 @@ def look(env: "Environment", scenario: int) -> tuple[Moment, Moment]:
 
 
 def draw(
-    spec: "Spec", scenario: int, start: Moment, goal: Moment, certificate: "Certificate"
+    spec: "Spec", scenario: int, start: Moment, goal: Moment, certificate: "Certificate | None"
 ) -> "Figure":
     """Lay out the picture: start above goal, cell and cameras side by side, certificate below.
 
@@ -117,15 +126,19 @@ def draw(
         scenario: Index that was drawn.
         start: The cell after the reset.
         goal: The cell at the goal.
-        certificate: The task's certificate.
+        certificate: The task's certificate; None leaves it out.
 
     Returns:
         The figure.
     """
     from matplotlib.figure import Figure
 
+    from hvs_suite.registry import options_of
+    from hvs_suite.tasks.shared.option_types import listed
+
     words = spec.describe()
-    table_in = ROW_IN * (len(certificate.checks) + 2)
+    table_in = 0.0 if certificate is None else ROW_IN * (len(certificate.checks) + 2)
+    changed = listed(options_of(spec))
     head_in, gap_in, edge_in = 1.2, 0.45, 0.25
     height = head_in + 2 * (PANEL_IN + gap_in) + table_in + edge_in
     figure = Figure(figsize=(FIGURE_WIDTH_IN, height))
@@ -133,7 +146,8 @@ def draw(
     def put_text(x_in: float, y_in: float, text: str, **style: Any) -> None:
         figure.text(x_in / FIGURE_WIDTH_IN, 1 - y_in / height, text, va="top", **style)
 
-    put_text(edge_in, 0.2, f"{spec.name}-v{spec.version}", size=19, weight="bold", color=INK)
+    name = f"{spec.name}-v{spec.version}" + (f" with {changed}" if changed else "")
+    put_text(edge_in, 0.2, name, size=19, weight="bold", color=INK)
     put_text(
         edge_in,
         0.62,
@@ -173,7 +187,8 @@ def draw(
             )
             axes.imshow(image, interpolation=interpolation)
             axes.set_axis_off()
-    _draw_table(put_text, height - edge_in - table_in + 0.05, edge_in, certificate)
+    if certificate is not None:
+        _draw_table(put_text, height - edge_in - table_in + 0.05, edge_in, certificate)
     return figure
 
 

@@ -47,17 +47,17 @@ class Compression:
 
     def run(self) -> None:
         """Measure, showing how it goes; write and print what was found."""
-        from hvs_suite.eval import compression_report, compression_study
+        from hvs_suite.eval.studies import compression, compression_report
         from hvs_suite.files import check_writable
 
         check_writable(self.out / "study.json")
-        settings = self.setting or compression_study.DEFAULT_SETTINGS
-        encodings = [compression_study.parse_setting(text) for text in settings]
-        training = compression_study.Training(self.steps, self.seed, self.episodes, self.workers)
-        compression_study.check(encodings, training)
+        settings = self.setting or compression.DEFAULT_SETTINGS
+        encodings = [compression.parse_setting(text) for text in settings]
+        training = compression.Training(self.steps, self.seed, self.episodes, self.workers)
+        compression.check(encodings, training)
         data = self._recorded() if self.data is None else self.data
         with console.meter() as update:
-            study = compression_study.run_study(data, self.out, encodings, training, update)
+            study = compression.run_study(data, self.out, encodings, training, update)
         _write_json(self.out, study)
         text = compression_report.markdown(study)
         _write_report(self.out, text, compression_report.draw(study))
@@ -112,11 +112,11 @@ class Ablation:
 
     def run(self) -> None:
         """Train and judge, showing how it goes; write and print what was found."""
-        from hvs_suite.eval import ablation_study
+        from hvs_suite.eval.studies import ablation
         from hvs_suite.files import check_writable
 
         check_writable(self.out / "study.json")
-        budget = ablation_study.Budget(
+        budget = ablation.Budget(
             steps=self.steps,
             dagger_rounds=self.dagger_rounds,
             dagger_frames=self.dagger_frames,
@@ -124,12 +124,12 @@ class Ablation:
             episodes=self.episodes,
             workers=self.workers,
         )
-        rows = self.row or tuple(ablation_study.ABLATIONS)
+        rows = self.row or tuple(ablation.ABLATIONS)
         with console.meter() as update:
-            study = ablation_study.run_study(self.data, self.out, rows, budget, update)
+            study = ablation.run_study(self.data, self.out, rows, budget, update)
         _write_json(self.out, study)
-        text = ablation_study.markdown(study)
-        _write_report(self.out, text, ablation_study.draw(study))
+        text = ablation.markdown(study)
+        _write_report(self.out, text, ablation.draw(study))
         _say(self.out, text)
 
 
@@ -173,7 +173,7 @@ class FewDemonstrations:
 
     def run(self) -> None:
         """Train and judge, showing how it goes; write and print what was found."""
-        from hvs_suite.eval import few_demonstrations, few_demonstrations_report
+        from hvs_suite.eval.studies import few_demonstrations, few_demonstrations_report
         from hvs_suite.files import check_writable
 
         check_writable(self.out / "study.json")
@@ -232,8 +232,8 @@ class Attention:
     def run(self) -> None:
         """Play, draw and write."""
         import hvs_suite
+        from hvs_suite.eval.studies.attention import draw_attention
         from hvs_suite.files import check_writable, replacing
-        from hvs_suite.policies.attention import draw_attention
         from hvs_suite.policies.catalogue import policy_factory
 
         check_writable(self.out)

@@ -5,6 +5,7 @@ import functools
 from pathlib import Path
 
 from hvs_suite.cli.rl_session import show_run
+from hvs_suite.errors import OptionError
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -33,6 +34,8 @@ class TrainSac:
         updates: Updates after each iteration.
         hidden_units: Width of each of the two dense layers behind the sub-networks.
         device: Where the networks are: cpu or cuda.
+        option: Parameter of the task to change for a study, such as target_diameter_m=0.03; give it
+            several times for several.
     """
 
     task: str
@@ -51,6 +54,7 @@ class TrainSac:
     updates: int = 1
     hidden_units: int = 256
     device: str = "cpu"
+    option: tuple[str, ...] = ()
 
     def run(self) -> None:
         """Train, showing how it goes, and say what came of it."""
@@ -67,7 +71,9 @@ class TrainSac:
             hidden=(self.hidden_units, self.hidden_units),
         )
         # Before SB3 is imported, which takes seconds.
-        registry.find(self.task)
+        options = registry.find(self.task).options_from_text(self.option)
+        if "rewards" in options:
+            raise OptionError("name the terms to learn from with --reward, not as an option")
         from hvs_suite.policies.sac.training import train_sac
         from hvs_suite.tasks.shared.spec import THESIS_REWARDS
 
@@ -78,6 +84,7 @@ class TrainSac:
             steps=self.steps,
             seed=self.seed,
             settings=settings,
+            options=options,
             rewards=self.reward or THESIS_REWARDS,
             eval_every=self.eval_every,
             eval_episodes=self.eval_episodes,

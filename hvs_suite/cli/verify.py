@@ -40,7 +40,8 @@ class Verify:
 
     def run(self) -> int:
         """Verify the files one after the other; stop at the first that fails."""
-        from hvs_suite.eval import result_file, submission, verification
+        from hvs_suite.eval.board import submission
+        from hvs_suite.eval.scoring import result_file, verification
 
         paths = verification.results_in(self.files)
         found = []

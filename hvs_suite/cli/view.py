@@ -27,6 +27,8 @@ class View:
         split: Name of the split the scenario comes from.
         policy: expert, zero, random, servo, pretrained, finetuned, or a checkpoint folder.
         out: Write a film (.mp4 or .gif) instead of opening a window.
+        option: Parameter of the task to change for a study, such as target_diameter_m=0.03; give it
+            several times for several.
     """
 
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
@@ -34,11 +36,12 @@ class View:
     split: str = "train"
     policy: str = "expert"
     out: Path | None = None
+    option: tuple[str, ...] = ()
 
     def run(self) -> None:
         """Play the episode and say how it ended."""
         import hvs_suite
-        from hvs_suite import pictures
+        from hvs_suite import pictures, registry
         from hvs_suite.files import check_writable
         from hvs_suite.policies.catalogue import policy_factory
 
@@ -47,8 +50,9 @@ class View:
         if self.out is not None:
             pictures.check_film_suffix(self.out)
             check_writable(self.out)
-        make = policy_factory(self.policy, self.task)
-        with hvs_suite.load(self.task, split=self.split) as env:
+        options = registry.find(self.task).options_from_text(self.option)
+        make = policy_factory(self.policy, self.task, options)
+        with hvs_suite.load(self.task, split=self.split, **options) as env:
             policy = make(env)
             if self.out is None:
                 episode = play_in_window(env, policy, self.scenario)

@@ -48,7 +48,7 @@ class HvsEnvConfig(EnvConfig):
 
     def __post_init__(self) -> None:
         spec = self.spec
-        self.fps = round(1.0 / spec.control_period_s)
+        self.fps = spec.fps
         self.features = _features(spec)
         self.features_map = {name: name for name in self.features}
 

@@ -11,23 +11,16 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from hvs_suite.datasets.features import dataset_features
-from hvs_suite.policies.dagger import play_round, read_round
-from hvs_suite.policies.demonstrations import (
-    GOAL_NORMAL,
-    GOAL_POSITION,
-    TARGET_PREFIX,
-    FramePool,
-    Manifest,
-)
 from hvs_suite.policies.finetune.folding import load_base, write_folded
 from hvs_suite.policies.finetune.settings import Settings
+from hvs_suite.policies.finetune.stage import MakeStage
+from hvs_suite.policies.hvs.dataset import GOAL_NORMAL, GOAL_POSITION, TARGET_PREFIX, Manifest
 from hvs_suite.policies.hvs.network import (
     IMAGE_PREFIX,
     MEMORY,
@@ -37,6 +30,8 @@ from hvs_suite.policies.hvs.network import (
     sighting_loss,
     target_loss,
 )
+from hvs_suite.policies.imitation.dagger import RoundSummary, play_round, read_round
+from hvs_suite.policies.imitation.demonstrations import FramePool, Recording
 from hvs_suite.policies.rl.evaluation import Evaluation, read_evaluations, write_evaluations
 from hvs_suite.policies.rl.journal import SCENES_A_SEED
 from hvs_suite.tasks.shared.spec import Spec
@@ -49,14 +44,10 @@ ORDER_STREAM = 4
 
 
 def train_eyes(
-    base: Path,
+    run: MakeStage,
     folder: Path,
     spec: Spec,
-    options: Mapping[str, Any],
-    split: str,
-    seed: int,
-    settings: Settings,
-    examine: Callable[[Path, int, int], Evaluation],
+    evaluate: Callable[[Path, int, int], Evaluation],
     on_share: Callable[[str, float], None],
 ) -> Path:
     """Let the policy play and train its eyes on what it saw, round by round.
@@ -65,66 +56,40 @@ def train_eyes(
     scenes are solved than before are not kept.
 
     Args:
-        base: Checkpoint to begin with.
+        run: Whose base to begin with, and whose task, stream of scenes, seed and settings to take.
         folder: Gets a folder a round: its frames, the checkpoint that came of it, and
             ``outcome.json`` with the seconds of the sitting that finished it; and
             ``evaluations.json``, of the base and of each round.
-        spec: The named task.
-        options: Task options that differ from it.
-        split: Stream of scenes.
-        seed: Of the run.
-        settings: How many rounds, frames and steps.
-        examine: Evaluates a checkpoint, given the frames played and the optimiser steps so far.
+        spec: The task.
+        evaluate: Evaluates a checkpoint, given the frames played and the optimiser steps so far.
         on_share: Called with ``looking`` or ``training eyes``, and the share of it that is done.
 
     Returns:
         The checkpoint that solved most; of equals the last, and the base if there are no rounds.
     """
+    base, seed, settings = run.base, run.seed, run.settings
     results = folder / "evaluations.json"
     evaluations = read_evaluations(results, sys.maxsize)
 
     def success_of(checkpoint: Path, number: int) -> float:
         if len(evaluations) == number:
             played, learned = number * settings.eye_frames, number * settings.eye_steps
-            evaluations.append(examine(checkpoint, played, learned))
+            evaluations.append(evaluate(checkpoint, played, learned))
             write_evaluations(results, evaluations)
         return evaluations[number].success_rate
 
-    manifest = Manifest(folder, spec.name, split, options, dataset_features(spec), 0, 0)
-    pool: FramePool | None = None
+    if not settings.eye_rounds:
+        return base
+    folder.mkdir(parents=True, exist_ok=True)
+    manifest = Manifest(folder, spec.name, run.split, run.options, dataset_features(spec), 0, 0)
+    pool = FramePool(manifest, seed, load_base(base).calibration)
     scene = seed * SCENES_A_SEED + FIRST_SCENE
-    best = base
-    if settings.eye_rounds:
-        folder.mkdir(parents=True, exist_ok=True)
-        success = success_of(base, 0)
+    best, success = base, success_of(base, 0)
     for number in range(settings.eye_rounds):
         began = time.perf_counter()
         place = folder / f"round-{number + 1}"
-        frames = place / "frames"
-        if read_round(frames) is None:
-            place.mkdir(parents=True, exist_ok=True)
-            seen = 0
-
-            def note(count: int) -> None:
-                nonlocal seen
-                seen += count
-                on_share("looking", seen / settings.eye_frames)
-
-            play_round(
-                manifest,
-                best,
-                frames,
-                frames=settings.eye_frames,
-                first_scenario=scene,
-                workers=settings.environments,
-                labelled=False,
-                on_frames=note,
-            )
-        found = read_round(frames)
-        assert found is not None
-        summary, recording = found
+        summary, recording = _look(manifest, best, place / "frames", scene, settings, on_share)
         scene = summary.next_scenario
-        pool = pool or FramePool(manifest, seed, load_base(base).calibration)
         pool.add(recording)
         improved = place / "checkpoint"
         if not (improved / "config.json").exists():
@@ -132,11 +97,45 @@ def train_eyes(
             _train(network, pool, settings, [seed, number], on_share)
             seconds = {"train_s": time.perf_counter() - began}
             (place / "outcome.json").write_text(json.dumps(seconds), encoding="utf-8")
-            write_folded(best, network, improved)
+            write_folded(best, network, improved, spec)
         solved = success_of(improved, number + 1)
         if solved >= success:
             best, success = improved, solved
     return best
+
+
+def _look(
+    manifest: Manifest,
+    checkpoint: Path,
+    frames: Path,
+    first_scenario: int,
+    settings: Settings,
+    on_share: Callable[[str, float], None],
+) -> tuple[RoundSummary, Recording]:
+    """Let a checkpoint play a round, unless it was played; what came of it, and its frames."""
+    if (found := read_round(frames)) is not None:
+        return found
+    frames.parent.mkdir(parents=True, exist_ok=True)
+    seen = 0
+
+    def note(count: int) -> None:
+        nonlocal seen
+        seen += count
+        on_share("looking", seen / settings.eye_frames)
+
+    play_round(
+        manifest,
+        checkpoint,
+        frames,
+        frames=settings.eye_frames,
+        first_scenario=first_scenario,
+        workers=settings.environments,
+        labelled=False,
+        on_frames=note,
+    )
+    found = read_round(frames)
+    assert found is not None
+    return found
 
 
 def _train(

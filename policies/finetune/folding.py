@@ -9,9 +9,11 @@ from safetensors.torch import save
 
 from hvs_suite.errors import PolicyError
 from hvs_suite.files import replacing
-from hvs_suite.policies.checkpoint import NETWORK_PREFIX, STANDARD_STEPS, load_network
-from hvs_suite.policies.checkpoint_files import read_config
+from hvs_suite.policies.checkpoints.files import read_config
+from hvs_suite.policies.checkpoints.loading import NETWORK_PREFIX, STANDARD_STEPS, load_network
 from hvs_suite.policies.hvs.network import HvsNetwork
+from hvs_suite.policies.trained_for import trained_for
+from hvs_suite.tasks.shared.spec import Spec
 
 
 def load_base(folder: Path) -> HvsNetwork:
@@ -48,16 +50,18 @@ def with_residual(base: HvsNetwork, hidden: int, bound: float) -> HvsNetwork:
     return network.eval()
 
 
-def write_folded(base: Path, network: HvsNetwork, out: Path) -> None:
+def write_folded(base: Path, network: HvsNetwork, out: Path, spec: Spec) -> None:
     """Write a network as a checkpoint that LeRobot and the suite load, each file whole.
 
     Args:
         base: Checkpoint that it was made from; gives configuration and processors.
         network: Its inputs are the base's.
         out: Gets ``config.json``, ``model.safetensors`` and the two processors.
+        spec: Task that it was trained on last, its options included.
     """
     out.mkdir(parents=True, exist_ok=True)
     config = read_config(base)
+    config |= trained_for(spec).model_dump()
     config["residual_hidden"] = network.shape.residual_hidden
     config["residual_bound"] = network.shape.residual_bound
     weights = {

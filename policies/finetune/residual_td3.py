@@ -146,7 +146,7 @@ class ResidualTD3(TD3):
     penalty: float
     bound: float
 
-    def learn_meanwhile(self) -> None:
+    def learn_overlapped(self) -> None:
         """The updates that fall to a step of the environments, made while these play it."""
         memory, steps = self.replay_buffer, self.train_freq
         assert memory is not None

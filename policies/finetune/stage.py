@@ -5,6 +5,7 @@ made of them, a hundred numbers, so that an update costs as much as RL on states
 what only the simulator knows; the actor, which has to do without in the end, does not.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,13 +15,17 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from gymnasium import spaces
+from stable_baselines3.common.monitor import Monitor
 
 from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S, after_commands
-from hvs_suite.policies.checkpoint import network_inputs
+from hvs_suite.policies.checkpoints.loading import network_inputs
 from hvs_suite.policies.finetune.folding import load_base
+from hvs_suite.policies.finetune.settings import Settings
 from hvs_suite.policies.hvs.compiled import CompiledFeatures
 from hvs_suite.policies.hvs.network import N_JOINTS
+from hvs_suite.policies.rl.curriculum import Curriculum
+from hvs_suite.policies.rl.journal import OUTCOMES, Journal
 from hvs_suite.rollout import one_torch_thread
 
 FEATURES = "features"
@@ -165,3 +170,42 @@ class ResidualStage(gymnasium.Wrapper[Any, Any, Any, Any]):
             FEATURES: features[0].numpy().copy(),
             PRIVILEGED: privileged_state(self._environment, self._network.shape.error_scale),
         }
+
+
+@dataclasses.dataclass(frozen=True)
+class MakeStage:
+    """Makes one of a run's environments; travels to its worker.
+
+    Attributes:
+        task: Named task.
+        options: Task options that differ from it.
+        levels: Further options, of each level of the curriculum.
+        split: Stream of scenes.
+        base: Checkpoint that plays.
+        settings: Of the run.
+        seed: Of the run.
+        part: Which of the environments it is.
+    """
+
+    task: str
+    options: Mapping[str, Any]
+    levels: list[dict[str, Any]]
+    split: str
+    base: Path
+    settings: Settings
+    seed: int
+    part: int = 0
+
+    def __call__(self) -> gymnasium.Env[Any, Any]:
+        """Make it."""
+        settings = self.settings
+        env = Curriculum(self.task, self.levels, split=self.split, **self.options)
+        # The monitor inside: it sees the task's own rewards.
+        stage = ResidualStage(
+            Monitor(env, info_keywords=OUTCOMES),
+            self.base,
+            settings.bound,
+            settings.shaping,
+            settings.gamma,
+        )
+        return Journal(stage, self.seed, self.part, settings.environments, settings.lost_share)

@@ -8,41 +8,42 @@ same command is given again.
 
 import contextlib
 import dataclasses
-import json
 import math
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
-from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
 
-from hvs_suite.policies.allocator import keep_freed_memory
 from hvs_suite.policies.catalogue import name_of
-from hvs_suite.policies.checkpoint import (
+from hvs_suite.policies.checkpoints.files import read_config
+from hvs_suite.policies.checkpoints.loading import (
     CheckpointPolicy,
     check_fit,
     weights_digest,
 )
-from hvs_suite.policies.checkpoint_files import read_config
 from hvs_suite.policies.finetune.eyes import train_eyes
 from hvs_suite.policies.finetune.folding import load_base, with_residual, write_folded
-from hvs_suite.policies.finetune.meanwhile import Meanwhile, MeanwhileHere, MeanwhileThere
 from hvs_suite.policies.finetune.outlook import Outlook
+from hvs_suite.policies.finetune.overlapped import (
+    Overlapped,
+    OverlappedDummyVecEnv,
+    OverlappedSubprocVecEnv,
+)
 from hvs_suite.policies.finetune.residual_td3 import ResidualPolicy, ResidualTD3
 from hvs_suite.policies.finetune.settings import Settings
-from hvs_suite.policies.finetune.stage import ResidualStage
+from hvs_suite.policies.finetune.stage import MakeStage
 from hvs_suite.policies.hvs.network import N_JOINTS, HvsNetwork
-from hvs_suite.policies.rl.curriculum import Curriculum, Kind, levels_of
-from hvs_suite.policies.rl.evaluation import Evaluation, Examiner
-from hvs_suite.policies.rl.journal import OUTCOMES, Journal
-from hvs_suite.policies.rl.run import Budget, Outcome, Progress, Run, check_run
-from hvs_suite.policies.run_folder import claimed, write_train_config
-from hvs_suite.registry import find
+from hvs_suite.policies.rl.curriculum import Kind, levels_of
+from hvs_suite.policies.rl.evaluation import Evaluation, Evaluator
+from hvs_suite.policies.rl.run import Outcome, Progress, Run, check_run
+from hvs_suite.policies.training.budget import Budget
+from hvs_suite.policies.training.process import prepare_process
+from hvs_suite.policies.training.run_folder import claimed, write_train_config
+from hvs_suite.registry import find, options_of
 from hvs_suite.rollout import library_seeds, worker_conditions
 from hvs_suite.tasks.shared.spec import Spec
 
@@ -97,20 +98,19 @@ def finetune(
         OutputError: ``out`` cannot be written, or holds something else than this run.
     """
     settings = settings or Settings()
-    options = dict(options or {})
-    spec = find(task).with_options(options)
+    spec = find(task).with_options(options or {})
+    options = options_of(spec)
     limit = Budget(steps, minutes)
     check_run(seed, split, eval_every, eval_episodes)
-    levels = levels_of(task, curriculum) if curriculum is not None else [{}]
+    levels = levels_of(task, curriculum, options) if curriculum is not None else [{}]
     check_fit(read_config(policy), policy, spec)
     load_base(policy)
-    keep_freed_memory()
-    torch.set_num_threads(min(2, torch.get_num_threads()))
+    prepare_process()
     identity = {
         "base": weights_digest(policy),
         "task": task,
         "task_version": spec.version,
-        "options": json.loads(json.dumps(options)),
+        "options": options,
         "curriculum": curriculum,
         "split": split,
         "seed": seed,
@@ -120,86 +120,60 @@ def finetune(
         stack.enter_context(claimed(out, identity))
         budget = {"minutes": minutes, "steps": steps}
         write_train_config(out, identity, budget, PACKAGES, policy=name_of(policy))
-        training = out / "training"
-
-        def on_eyes(stage: str, share: float) -> None:
-            if on_progress is not None:
-                on_progress(Progress(stage, share, 0, 0, 0.0, math.nan, math.nan, None))
-
         # Torch and SB3 draw from the global generators of NumPy and torch.
         stack.enter_context(library_seeds(seed))
-        examiner = stack.enter_context(contextlib.closing(Examiner(spec, options, eval_episodes)))
-
-        def examine(checkpoint: Path, frames: int, updates: int) -> Evaluation:
-            return examiner.evaluate(
-                CheckpointPolicy(checkpoint, spec),
-                frames,
-                updates,
-                on_episode=lambda done: on_eyes("evaluating", done / eval_episodes),
-            )
-
-        base = train_eyes(
-            policy, training / "eyes", spec, options, split, seed, settings, examine, on_eyes
-        )
-        if settings.environments > 1:
-            # They and the learner play and learn at the same time.
-            torch.set_num_threads(1)
-        environments = _environments(MakeStage(task, options, levels, split, base, settings, seed))
-        stack.callback(environments.close)
-        model = _make_model(environments, load_base(base), settings, seed)
-        learner = _Finetuned(model, base, out, spec)
-        run = Run(out, learner, examiner, on_progress)
+        evaluator = stack.enter_context(contextlib.closing(Evaluator(spec, options, eval_episodes)))
+        make = MakeStage(task, options, levels, split, policy, settings, seed)
+        base = _with_new_eyes(make, out / "training" / "eyes", spec, evaluator, on_progress)
+        learner = stack.enter_context(_learner(dataclasses.replace(make, base=base), out, spec))
+        run = Run(out, learner, evaluator, on_progress)
         stack.callback(run.close)
         run.train(limit, settings.collect_steps, eval_every, checkpoint_period_s)
         return run.outcome()
 
 
-@dataclasses.dataclass(frozen=True)
-class MakeStage:
-    """Makes one of a run's environments; travels to its worker.
+def _with_new_eyes(
+    make: MakeStage,
+    folder: Path,
+    spec: Spec,
+    evaluator: Evaluator,
+    on_progress: Callable[[Progress], None] | None,
+) -> Path:
+    """The base with the eyes that RL is to begin with: its own, or better ones."""
 
-    Attributes:
-        task: Named task.
-        options: Task options that differ from it.
-        levels: Further options, of each level of the curriculum.
-        split: Stream of scenes.
-        base: Checkpoint that plays.
-        settings: Of the run.
-        seed: Of the run.
-        part: Which of the environments it is.
-    """
+    def on_share(stage: str, share: float) -> None:
+        if on_progress is not None:
+            on_progress(Progress(stage, share, 0, 0, 0.0, math.nan, math.nan, None))
 
-    task: str
-    options: Mapping[str, Any]
-    levels: list[dict[str, Any]]
-    split: str
-    base: Path
-    settings: Settings
-    seed: int
-    part: int = 0
-
-    def __call__(self) -> gymnasium.Env[Any, Any]:
-        """Make it."""
-        settings = self.settings
-        env = Curriculum(self.task, self.levels, split=self.split, **self.options)
-        # The monitor inside: it sees the task's own rewards.
-        stage = ResidualStage(
-            Monitor(env, info_keywords=OUTCOMES),
-            self.base,
-            settings.bound,
-            settings.shaping,
-            settings.gamma,
+    def evaluate(checkpoint: Path, frames: int, updates: int) -> Evaluation:
+        return evaluator.evaluate(
+            CheckpointPolicy(checkpoint, spec),
+            frames,
+            updates,
+            on_episode=lambda done: on_share("evaluating", done / evaluator.episodes),
         )
-        return Journal(stage, self.seed, self.part, settings.environments, settings.lost_share)
+
+    return train_eyes(make, folder, spec, evaluate, on_share)
 
 
-def _environments(make: MakeStage) -> Meanwhile:
+@contextlib.contextmanager
+def _learner(make: MakeStage, out: Path, spec: Spec) -> Iterator["_Finetuned"]:
+    """The model on its environments, which are closed in the end."""
+    if make.settings.environments > 1:
+        # They and the learner play and learn at the same time.
+        torch.set_num_threads(1)
+    with contextlib.closing(_environments(make)) as environments:
+        model = _make_model(environments, load_base(make.base), make.settings, make.seed)
+        yield _Finetuned(model, make.base, out, spec)
+
+
+def _environments(make: MakeStage) -> Overlapped:
     """All environments of a run: a process each, or this one for a single one."""
     parts = [dataclasses.replace(make, part=i) for i in range(make.settings.environments)]
     if len(parts) == 1:
-        return MeanwhileHere([*parts])
+        return OverlappedDummyVecEnv([*parts])
     with worker_conditions():
-        return MeanwhileThere([*parts], start_method="spawn")
+        return OverlappedSubprocVecEnv([*parts], start_method="spawn")
 
 
 class _Finetuned:
@@ -221,7 +195,7 @@ class _Finetuned:
         residual = self._network.residual
         assert residual is not None
         residual.load_state_dict(self.model.actor_target.mu.state_dict())
-        write_folded(self._base, self._network, self._candidate)
+        write_folded(self._base, self._network, self._candidate, self._variant)
         return CheckpointPolicy(self._candidate, self._variant)
 
     def keep(self) -> None:
@@ -232,7 +206,7 @@ class _Finetuned:
 
 
 def _make_model(
-    environments: Meanwhile, base: HvsNetwork, settings: Settings, seed: int
+    environments: Overlapped, base: HvsNetwork, settings: Settings, seed: int
 ) -> ResidualTD3:
     sigma = np.full(N_JOINTS, settings.noise)
     model = ResidualTD3(
@@ -246,7 +220,7 @@ def _make_model(
         tau=settings.tau,
         gamma=settings.gamma,
         train_freq=(settings.collect_steps // settings.environments, "step"),
-        # None after the steps: they are made meanwhile.
+        # None after the steps: they overlap with the playing.
         gradient_steps=0,
         action_noise=NormalActionNoise(np.zeros(N_JOINTS), sigma),
         # A time limit is a failure, and critics see it coming: nothing is worth anything beyond.
@@ -268,5 +242,5 @@ def _make_model(
     model.warm_up_steps = settings.warm_up_steps
     model.penalty = settings.penalty
     model.bound = settings.bound
-    environments.meanwhile = model.learn_meanwhile
+    environments.overlapped = model.learn_overlapped
     return model

@@ -11,8 +11,14 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from hvs_suite.errors import OutputError, first_line
+from hvs_suite.errors import DatasetError, OutputError, first_line
 from hvs_suite.policies.hvs.configuration_hvs import HvsConfig
+from hvs_suite.policies.hvs.dataset import (
+    GOAL_NORMAL,
+    GOAL_POSITION,
+    TARGET_PREFIX,
+    calibration_of,
+)
 from hvs_suite.policies.hvs.network import (
     IMAGE_PREFIX,
     MEMORY,
@@ -25,10 +31,6 @@ from hvs_suite.policies.hvs.network import (
     target_loss,
 )
 from hvs_suite.policies.hvs.rehearsal import drawn_sightings
-
-GOAL_POSITION = "privileged.goal_position"
-GOAL_NORMAL = "privileged.goal_normal"
-TARGET_PREFIX = "privileged.target_"
 
 logger = logging.getLogger(__name__)
 
@@ -75,9 +77,6 @@ class HvsPolicy(PreTrainedPolicy):
             self._calibrate_from(Path(dataset_meta.root))
 
     def _calibrate_from(self, root: Path) -> None:
-        from hvs_suite.errors import DatasetError
-        from hvs_suite.policies.demonstrations import calibration_of
-
         try:
             self.network.set_calibration(calibration_of(root))
         except DatasetError as error:

@@ -439,10 +439,7 @@ class HvsNetwork(nn.Module):
         """
         features = [s.features() for s in sightings.values()]
         if state is None:
-            inputs = torch.cat(features, dim=1)
-            out = self.head(inputs)
-            out, known = self._with_residual(inputs, out, out)
-            return Decision(out, known, sightings, None, None, None)
+            return self._decide_without_joints(sightings, torch.cat(features, dim=1))
         q = state[:, :N_JOINTS]
         if memory is None:
             memory = state.new_zeros(len(state), memory_size(len(sightings)))
@@ -471,11 +468,8 @@ class HvsNetwork(nn.Module):
             features.append(torch.asinh(each / scale)[:, :-1])
         # From where the arm is sent: it trails its set point, and may not even have begun to move.
         pending = set_point - q
-        sent = geometry.flange_motion(set_point)
         begun = set_point - self.origin(state, remembered)
-        onward_step = begun + geometry.joint_step(sent, goals[0] - sent.position)
-        onward_step = torch.asinh(onward_step / scale)
-        onward = [torch.asinh((begun + w[-1]) / scale) for w in self._ways(set_point, goals)]
+        onward_step, onward = self._onward(set_point, begun, goals)
         later = [torch.asinh(pending / scale), onward_step, *onward]
         # What geometry alone would do, each with its gain.
         proposals = [(self.step_gain, onward_step, self.stride_gain, onward)]
@@ -505,13 +499,37 @@ class HvsNetwork(nn.Module):
         if not self.training:
             # As long as all cameras are sure that the target is hidden, and none has seen it, the
             # head can know no way there. What it learns in training must not wait for eyes.
-            has_seen = slots[:, SLOT_SIZE - 1 :: SLOT_SIZE].amax(dim=1) > 0
-            for sighting in sightings.values():
-                has_seen = has_seen | (sighting.visible_logit[:, 0] > -SEEN_LOGIT)
-            out = torch.where(has_seen[:, None], out, self._look_out(set_point, begun))
+            looks_out = self._look_out(set_point, begun)
+            out = torch.where(_has_seen(slots, sightings)[:, None], out, looks_out)
         useful = self._within_reach(out, begun)
         out, known = self._with_residual(inputs, out, useful)
         return Decision(out, known, sightings, target, remembered, motion)
+
+    def _decide_without_joints(self, sightings: dict[str, Sighting], inputs: Tensor) -> Decision:
+        """Decide on nothing but what the eyes make of the images, (B, n)."""
+        out = self.head(inputs)
+        out, known = self._with_residual(inputs, out, out)
+        return Decision(out, known, sightings, None, None, None)
+
+    def _onward(
+        self, set_point: Tensor, begun: Tensor, goals: list[Tensor]
+    ) -> tuple[Tensor, list[Tensor]]:
+        """What geometry alone would do from where the arm is sent.
+
+        Args:
+            set_point: Where that is, (B, 7) rad.
+            begun: The same, from where steps are counted, (B, 7) rad.
+            goals: Of the flange, (B, 3) m each.
+
+        Returns:
+            The straight step to the first goal, and the step towards a plain posture over each, as
+            the head says them, (B, 7).
+        """
+        scale = self.shape.error_scale
+        sent = geometry.flange_motion(set_point)
+        step = begun + geometry.joint_step(sent, goals[0] - sent.position)
+        strides = [torch.asinh((begun + w[-1]) / scale) for w in self._ways(set_point, goals)]
+        return torch.asinh(step / scale), strides
 
     def _ways(self, q: Tensor, goals: list[Tensor]) -> list[tuple[Tensor, ...]]:
         """The ways to plain postures over some goals.
@@ -818,3 +836,11 @@ def sighting_loss(sighting: Sighting, truth: Tensor) -> Tensor:
     size = F.smooth_l1_loss(sighting.log_diameter, log_diameter, beta=0.1, reduction="none")
     known = F.binary_cross_entropy_with_logits(sighting.visible_logit, visible)
     return (10.0 * centre * inside).sum() / count + (size * inside).sum() / count + 0.3 * known
+
+
+def _has_seen(slots: Tensor, sightings: Mapping[str, Sighting]) -> Tensor:
+    """Whether a camera has seen the target in this episode, or may see it now, (B,)."""
+    seen = slots[:, SLOT_SIZE - 1 :: SLOT_SIZE].amax(dim=1) > 0
+    for sighting in sightings.values():
+        seen = seen | (sighting.visible_logit[:, 0] > -SEEN_LOGIT)
+    return seen

@@ -9,6 +9,7 @@ the arm starts.
 import dataclasses
 from collections import deque
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Literal
 
 import gymnasium
@@ -27,13 +28,16 @@ THRESHOLD = 0.8
 """Share of them to solve before the next level."""
 
 
-def levels_of(task: str, kind: Kind) -> list[dict[str, Any]]:
+def levels_of(
+    task: str, kind: Kind, options: Mapping[str, Any] = MappingProxyType({})
+) -> list[dict[str, Any]]:
     """Levels of a named task, easiest first; the last is the task itself.
 
     Args:
         task: Named task.
         kind: ``tolerance`` shrinks all tolerances from eightfold by halves; ``start`` begins near
             the goal, then half of the episodes there, then where the task begins.
+        options: Options of the task that differ from the named one.
 
     Returns:
         Task options of each level.
@@ -42,7 +46,7 @@ def levels_of(task: str, kind: Kind) -> list[dict[str, Any]]:
         UnknownTaskError: There is no such task.
         OptionError: There is no such kind.
     """
-    spec = find(task)
+    spec = find(task).with_options(options)
     if kind == "start":
         return [*({"start": start} for start in STARTS), {}]
     if kind != "tolerance":
@@ -102,19 +106,19 @@ class Curriculum(gymnasium.Wrapper[Any, Any, Any, Any]):
         """The level now, from 0."""
         return self._level
 
-    def standing(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         """Level and outcomes that decide on the next, as JSON has it."""
         return {"level": self._level, "recent": list(self._recent)}
 
-    def restore(self, standing: Mapping[str, Any]) -> None:
-        """Go to where `standing` said that it was.
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go to where `state_dict` said that it was.
 
         Args:
-            standing: As `standing` gave it.
+            state: As `state_dict` gave it.
         """
         self._recent.clear()
-        self._recent.extend(bool(outcome) for outcome in standing["recent"])
-        self._go_to(int(standing["level"]))
+        self._recent.extend(bool(outcome) for outcome in state["recent"])
+        self._go_to(int(state["level"]))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

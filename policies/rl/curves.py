@@ -4,7 +4,7 @@ from typing import Any
 
 from stable_baselines3.common.logger import KVWriter
 
-from hvs_suite.policies.curves import Curves
+from hvs_suite.policies.training.curves import Curves
 
 
 class LoggedCurves(KVWriter):

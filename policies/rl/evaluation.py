@@ -51,6 +51,11 @@ class Evaluation:
         names = [field.name for field in dataclasses.fields(self)][3:-1]
         return {name: float(getattr(self, name)) for name in names} | self.errors
 
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Wilson's 95 % interval of the success rate (percent)."""
+        return wilson_interval(round(self.success_rate * self.episodes), self.episodes)
+
     def in_words(self) -> str:
         """The figures as one line."""
         errors = ", ".join(f"{name} {value:.3g}" for name, value in self.errors.items())
@@ -61,7 +66,7 @@ class Evaluation:
         )
 
 
-class Examiner:
+class Evaluator:
     """Plays the first scenes of `SPLIT`, always the same ones.
 
     Attributes:
@@ -174,8 +179,5 @@ def fallen(evaluations: Sequence[Evaluation]) -> bool:
     """
     if not evaluations:
         return False
-    ranges = [
-        wilson_interval(round(each.success_rate * each.episodes), each.episodes)
-        for each in evaluations
-    ]
+    ranges = [each.interval for each in evaluations]
     return ranges[-1][1] < max(low for low, _ in ranges)

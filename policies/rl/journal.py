@@ -51,32 +51,32 @@ class Journal(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._again = 0
         self._lost: list[int] = []
         self._actions: list[npt.NDArray[np.float32]] = []
-        self._standing: dict[str, Any] | None = None
+        self._curriculum: dict[str, Any] | None = None
 
-    def place(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         """Where it is, as JSON has it: what decides on the scene, and the actions since its reset.
 
-        Of a `Curriculum` inside, also its standing at that reset.
+        Of a `Curriculum` inside, also its state at that reset.
         """
-        place = {
+        state = {
             "episode": self._episode,
             "again": self._again,
             "lost": list(self._lost),
             "actions": [a.tolist() for a in self._actions],
         }
-        return place if self._standing is None else {**place, "curriculum": self._standing}
+        return state if self._curriculum is None else {**state, "curriculum": self._curriculum}
 
-    def go_to(self, place: Mapping[str, Any]) -> None:
-        """Let the next reset lead to where `place` said that it was.
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Let the next reset lead to where `state_dict` said that it was.
 
         Args:
-            place: As `place` gave it.
+            state: As `state_dict` gave it.
         """
-        self._episode, self._again = int(place["episode"]), int(place["again"])
-        self._lost = [int(scene) for scene in place["lost"]]
-        self._actions = [np.array(action, np.float32) for action in place["actions"]]
-        if "curriculum" in place:
-            self.get_wrapper_attr("restore")(place["curriculum"])
+        self._episode, self._again = int(state["episode"]), int(state["again"])
+        self._lost = [int(scene) for scene in state["lost"]]
+        self._actions = [np.array(action, np.float32) for action in state["actions"]]
+        if "curriculum" in state:
+            self.env.get_wrapper_attr("load_state_dict")(state["curriculum"])
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -88,8 +88,8 @@ class Journal(gymnasium.Wrapper[Any, Any, Any, Any]):
             options: Not used.
         """
         observation, info = self.env.reset(options={"scenario": self._scene()})
-        if self.has_wrapper_attr("standing"):
-            self._standing = self.get_wrapper_attr("standing")()
+        if self.env.has_wrapper_attr("state_dict"):
+            self._curriculum = self.env.get_wrapper_attr("state_dict")()
         for action in self._actions:
             observation, _, _, _, info = self.env.step(action)
         return observation, info

@@ -5,8 +5,7 @@ from pathlib import Path
 
 from hvs_suite.files import replacing
 from hvs_suite.policies.rl.evaluation import Evaluation
-from hvs_suite.policies.training_plot import PICTURE, read_curves
-from hvs_suite.statistics import wilson_interval
+from hvs_suite.policies.training.plot import PICTURE, read_curves
 
 ROLLOUT = {"rollout/success_rate": "solved", "rollout/collision": "collided"}
 LOSSES = {
@@ -37,10 +36,7 @@ def draw_rl_run(training: Path, evaluations: Sequence[Evaluation]) -> Path:
     success, haste, playing, learning = figure.subplots(1, 4)
     steps = [each.env_steps / 1000.0 for each in evaluations]
     rates = [100.0 * each.success_rate for each in evaluations]
-    ranges = [
-        wilson_interval(round(each.success_rate * each.episodes), each.episodes)
-        for each in evaluations
-    ]
+    ranges = [each.interval for each in evaluations]
     success.plot(steps, rates, color="tab:green", marker="o", markersize=3, linewidth=1.2)
     success.fill_between(
         steps, [low for low, _ in ranges], [high for _, high in ranges], color="tab:green",

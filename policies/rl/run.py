@@ -18,11 +18,10 @@ from stable_baselines3.common.logger import Logger
 
 from hvs_suite.errors import OptionError
 from hvs_suite.files import replacing
-from hvs_suite.policies.curves import Curves
 from hvs_suite.policies.rl.curves import LoggedCurves
 from hvs_suite.policies.rl.evaluation import (
     Evaluation,
-    Examiner,
+    Evaluator,
     fallen,
     read_evaluations,
     standing,
@@ -31,6 +30,8 @@ from hvs_suite.policies.rl.evaluation import (
 from hvs_suite.policies.rl.journal import OUTCOMES
 from hvs_suite.policies.rl.plot import draw_rl_run
 from hvs_suite.policies.rl.state import Counters, Model, load_run, save_run
+from hvs_suite.policies.training.budget import Budget
+from hvs_suite.policies.training.curves import Curves
 from hvs_suite.rollout import Policy
 from hvs_suite.tasks.shared.scenario import TEST_SPLIT
 
@@ -140,35 +141,6 @@ class Outcome:
         return "\n".join(lines)
 
 
-@dataclasses.dataclass(frozen=True)
-class Budget:
-    """How long to train: environment steps, minutes, or whichever is reached first.
-
-    Raises:
-        OptionError: Neither is given, or one makes no sense.
-    """
-
-    steps: int | None
-    minutes: float | None
-
-    def __post_init__(self) -> None:
-        """Refuse what is no budget."""
-        if self.minutes is None and self.steps is None:
-            raise OptionError("say how long to train: give minutes or steps")
-        for name, value in (("minutes", self.minutes), ("steps", self.steps)):
-            if value is not None and not (value > 0 and math.isfinite(value)):
-                raise OptionError(f"{name} must be above 0, not {value}")
-
-    def share(self, env_steps: int, elapsed_s: float) -> float:
-        """Part that is used up, 1 at the end."""
-        shares = [0.0]
-        if self.steps is not None:
-            shares.append(env_steps / self.steps)
-        if self.minutes is not None:
-            shares.append(elapsed_s / (60.0 * self.minutes))
-        return max(shares)
-
-
 def check_run(seed: int, split: str, eval_every: int, eval_episodes: int) -> None:
     """Refuse what no RL run can be made with.
 
@@ -196,7 +168,7 @@ class Run:
     Args:
         out: Folder of the run; its state lives in ``out/training``.
         learner: What learns.
-        examiner: Evaluates it.
+        evaluator: Evaluates it.
         on_progress: Called after every iteration and every episode of an evaluation.
     """
 
@@ -204,13 +176,13 @@ class Run:
         self,
         out: Path,
         learner: Learner,
-        examiner: Examiner,
+        evaluator: Evaluator,
         on_progress: Callable[[Progress], None] | None,
     ) -> None:
         self._training = out / "training"
         self._learner = learner
         self._model = model = learner.model
-        self._examiner = examiner
+        self._evaluator = evaluator
         self._on_progress = on_progress
         self._counters: Counters = load_run(self._training, model)
         # Share of the budget, environment steps and seconds after each of the last iterations.
@@ -287,12 +259,12 @@ class Run:
     def _evaluate(self) -> None:
         """Play greedily, film scene 0, keep the figures, and the policy if it is to be kept."""
         env_steps = self._model.num_timesteps
-        evaluation = self._examiner.evaluate(
+        evaluation = self._evaluator.evaluate(
             self._learner.policy(),
             env_steps,
             self._model._n_updates,
             self._training / "clips" / f"{env_steps:010d}.mp4",
-            lambda done: self._report("evaluating", done / self._examiner.episodes),
+            lambda done: self._report("evaluating", done / self._evaluator.episodes),
         )
         self._evaluations.append(evaluation)
         write_evaluations(self._training / "evaluations.json", self._evaluations)

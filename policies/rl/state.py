@@ -64,7 +64,7 @@ def save_run(folder: Path, model: Model, counters: Counters) -> None:
         "env_steps": model.num_timesteps,
         "updates": model._n_updates,
         "episodes": model._episode_num,
-        "places": model.env.env_method("place"),
+        "places": model.env.env_method("state_dict"),
         "recent": list(model.ep_info_buffer or ()),
         "recent_success": list(model.ep_success_buffer or ()),
         "numpy_rng": [rng[0], rng[1].tolist(), *rng[2:]],
@@ -105,8 +105,8 @@ def load_run(folder: Path, model: Model) -> Counters:
         model.ep_info_buffer = deque(header["recent"], maxlen=window)
         model.ep_success_buffer = deque(header["recent_success"], maxlen=window)
         assert model.env is not None
-        for part, place in enumerate(header["places"]):
-            model.env.env_method("go_to", place, indices=part)
+        for part, state in enumerate(header["places"]):
+            model.env.env_method("load_state_dict", state, indices=part)
         name, key, *rest = header["numpy_rng"]
         np.random.set_state((name, np.array(key, np.uint32), *rest))  # noqa: NPY002
         torch.set_rng_state(tensors["torch_rng"])

@@ -17,7 +17,7 @@ from gymnasium import spaces
 
 from hvs_suite.errors import PolicyError, first_line
 from hvs_suite.files import replacing
-from hvs_suite.policies.checkpoint_files import (
+from hvs_suite.policies.checkpoints.files import (
     CONFIG,
     WEIGHTS,
     Size,

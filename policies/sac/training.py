@@ -16,15 +16,16 @@ from gymnasium import spaces
 from stable_baselines3 import SAC
 
 from hvs_suite.errors import OptionError
-from hvs_suite.policies.allocator import keep_freed_memory
-from hvs_suite.policies.rl.evaluation import Examiner
+from hvs_suite.policies.rl.evaluation import Evaluator
 from hvs_suite.policies.rl.journal import Journal, make_journal
-from hvs_suite.policies.rl.run import Budget, Outcome, Progress, Run, check_run
-from hvs_suite.policies.run_folder import claimed, write_train_config
+from hvs_suite.policies.rl.run import Outcome, Progress, Run, check_run
 from hvs_suite.policies.sac.network import policy_kwargs
 from hvs_suite.policies.sac.playing import GreedyActor, save_actor, write_config
 from hvs_suite.policies.sac.settings import Settings
-from hvs_suite.registry import find
+from hvs_suite.policies.training.budget import Budget
+from hvs_suite.policies.training.process import prepare_process
+from hvs_suite.policies.training.run_folder import claimed, write_train_config
+from hvs_suite.registry import find, options_of
 from hvs_suite.rollout import library_seeds
 from hvs_suite.tasks.shared.spec import (
     PRESETS,
@@ -82,17 +83,16 @@ def train_sac(
         OutputError: ``out`` cannot be written, or holds something else than this run.
     """
     settings = settings or Settings()
-    options = {**(options or {}), "rewards": tuple(rewards)}
-    spec = find(task).with_options(options)
+    spec = find(task).with_options({**(options or {}), "rewards": tuple(rewards)})
+    options = options_of(spec)
     limit = Budget(steps, minutes)
     check_run(seed, split, eval_every, eval_episodes)
     _check(spec, device)
-    keep_freed_memory()
-    torch.set_num_threads(min(2, torch.get_num_threads()))
+    prepare_process()
     identity = {
         "task": task,
         "task_version": spec.version,
-        "options": json.loads(json.dumps(options)),
+        "options": options,
         "split": split,
         "seed": seed,
         **json.loads(json.dumps(dataclasses.asdict(settings))),
@@ -107,8 +107,8 @@ def train_sac(
         model = _make_model(journal, settings, seed, device)
         assert isinstance(model.observation_space, spaces.Dict)
         write_config(out, spec, model.observation_space, settings.hidden)
-        examiner = stack.enter_context(contextlib.closing(Examiner(spec, options, eval_episodes)))
-        run = Run(out, _Sac(out, model), examiner, on_progress)
+        evaluator = stack.enter_context(contextlib.closing(Evaluator(spec, options, eval_episodes)))
+        run = Run(out, _Sac(out, model), evaluator, on_progress)
         stack.callback(run.close)
         run.train(limit, settings.collect_steps, eval_every, checkpoint_period_s)
         return run.outcome()

@@ -1,8 +1,10 @@
 """Where a moving target is and will be: a Kalman filter over what both cameras saw of it.
 
 The state is place, velocity and acceleration on the surface, and the error that the eye-to-hand
-camera's calibration makes there, which is common to all its pictures. Between control steps the
-acceleration is a random walk (white jerk), or stays zero for targets known to move straight.
+camera's calibration makes there, which is common to all its pictures. A smooth motion that stays in
+a bounded place turns back: its jerk is, on the average, against its velocity, as in an oscillation
+of one pace. So the state moves on like that, and what this does not foresee is white jerk. For
+targets known to move straight pace, acceleration and jerk are zero.
 """
 
 import numpy as np
@@ -28,16 +30,22 @@ class MotionEstimate:
             surface (m).
         speed_m_s: Largest speed of the target (m/s).
         acceleration_m_s2: Its largest acceleration (m/s^2); 0 for straight motion.
-        jerk_m_s3: Standard deviation of how its acceleration changes (m/s^3).
+        pace_rad_s: Angular frequency w of the oscillation: jerk = -w^2 velocity (rad/s).
+        jerk_m_s3: Standard deviation of the jerk beside that (m/s^3).
     """
 
     def __init__(
-        self, eth_sigma_m: float, speed_m_s: float, acceleration_m_s2: float, jerk_m_s3: float
+        self,
+        eth_sigma_m: float,
+        speed_m_s: float,
+        acceleration_m_s2: float,
+        pace_rad_s: float,
+        jerk_m_s3: float,
     ) -> None:
         self._prior = (
             np.repeat([0.0, speed_m_s / 2.0, acceleration_m_s2 / 2.0, eth_sigma_m], 2) + 1e-9
         )
-        self._jerk = jerk_m_s3
+        self._pace, self._jerk = pace_rad_s, jerk_m_s3
         self._x: FloatArray | None = None
         self._P: FloatArray = np.zeros((8, 8))
         self._outliers = 0
@@ -72,10 +80,20 @@ class MotionEstimate:
 
     def _predicted(self, ahead_s: float) -> tuple[FloatArray, FloatArray]:
         assert self._x is not None
+        # Place, velocity and acceleration under jerk = -w^2 velocity, which for w = 0 is constant
+        # acceleration. NumPy's sinc(x) is sin(pi x) / (pi x).
+        turn = self._pace * ahead_s
+        cos, sin_over_pace = np.cos(turn), ahead_s * np.sinc(turn / np.pi)
+        lean = 0.5 * (ahead_s * np.sinc(0.5 * turn / np.pi)) ** 2
         F = np.eye(8)
-        F[_PLACE, _VELOCITY] = ahead_s * np.eye(2)
-        F[_PLACE, _ACCELERATION] = 0.5 * ahead_s**2 * np.eye(2)
-        F[_VELOCITY, _ACCELERATION] = ahead_s * np.eye(2)
+        F[:6, :6] = np.kron(
+            [
+                [1.0, sin_over_pace, lean],
+                [0.0, cos, sin_over_pace],
+                [0.0, -(self._pace**2) * sin_over_pace, cos],
+            ],
+            np.eye(2),
+        )
         # White jerk: the discrete process noise of a Wiener-process acceleration model (Bar-Shalom,
         # Li and Kirubarajan, "Estimation with applications to tracking and navigation", 6.2.3).
         t = ahead_s

@@ -15,9 +15,8 @@ from hvs_suite.tasks.track import TrackSpec
 
 FloatArray = npt.NDArray[np.float64]
 
-_FREQUENCY_RAD_S = 2.0
-"""What a practitioner would take for the pace at which a smooth motion changes: jerk over
-acceleration."""
+_UNFORESEEN = 0.25
+"""Share of a curve's jerk that an oscillation at the pace of its bounds does not explain."""
 _MAX_HEIGHT_M = 0.30
 
 
@@ -41,11 +40,11 @@ class MovingTargetServo(StillTargetServo):
         self._motion = self._new_motion()
 
     def _new_motion(self) -> MotionEstimate:
-        spec = self._spec
+        spec, speed = self._spec, self._spec.speed_m_s[1]
         acceleration = spec.acceleration_m_s2 if spec.motion == "curve" else 0.0
-        return MotionEstimate(
-            self._eth_sigma_m, spec.speed_m_s[1], acceleration, _FREQUENCY_RAD_S * acceleration
-        )
+        pace = acceleration / speed
+        jerk = _UNFORESEEN * pace * acceleration
+        return MotionEstimate(self._eth_sigma_m, speed, acceleration, pace, jerk)
 
     def _perceive(self, observation: Observation, q: FloatArray) -> None:
         """Take in both pictures."""

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from hvs_suite.cell.kinematics import kinematics, travel_time
+from hvs_suite.cell.kinematics import away_from_stops, kinematics, travel_time
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
 from hvs_suite.errors import LockError
 from hvs_suite.files import replacing
@@ -216,8 +216,9 @@ def check_legs(
 def check_path(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
     """Can the arm stay with a moving goal: within its ranges, well below its speeds, in time?
 
-    A posture at the start of the path is carried along it, each time to the nearest one. The
-    soonest that keeps the bounds is taken; where none does, the one that needs the least speed.
+    A posture at the start of the path is carried along it, each time to the nearest one, pushed a
+    little away from the joints' stops. The soonest that keeps the bounds is taken; where none does,
+    of those with the least speed the one with the largest margin.
 
     Args:
         env: The named task.
@@ -239,7 +240,7 @@ def check_path(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
         margin, share = -math.inf, math.inf
         for q in family[np.argsort(times)]:
             found = _carry(q, goals, spec.control_period_s)
-            if found[1] < share:
+            if (max(found[1], MAX_SPEED_SHARE), -found[0]) < (max(share, MAX_SPEED_SHARE), -margin):
                 margin, share = found
             if margin >= MIN_JOINT_MARGIN_DEG and share <= MAX_SPEED_SHARE:
                 break
@@ -269,7 +270,9 @@ def _carry(q: FloatArray, goals: Sequence[Goal], period_s: float) -> tuple[float
     """Least margin to a joint stop (deg) and largest share of a joint's speed along a path."""
     margin, share = math.inf, 0.0
     for goal in goals:
-        near = kinematics().nearest_configuration(q, goal.position, goal.normal, JOINT_SPEED_RAD_S)
+        near = kinematics().nearest_configuration(
+            away_from_stops(q), goal.position, goal.normal, JOINT_SPEED_RAD_S
+        )
         if near is None:
             return -math.inf, math.inf
         if margin < math.inf:

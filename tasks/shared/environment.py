@@ -27,6 +27,7 @@ from dm_control import composer
 from dm_env import specs
 
 from hvs_suite.cell.cameras import CameraImage
+from hvs_suite.cell.physics import Physics
 from hvs_suite.cell.renderer import Renderer
 from hvs_suite.cell.solid import Solid
 from hvs_suite.errors import ScenarioError
@@ -364,10 +365,16 @@ class Environment(composer.Environment):
         }
 
     def _upload_textures(self) -> None:
-        for renderer in (self._renderer, *self._studio.values()):
-            if renderer is not None:
+        for drawer in (self._renderer, *self._studio.values(), self._physics):
+            if drawer is not None:
                 for texture in self._arm.textures_to_upload():
-                    renderer.upload_texture(texture)
+                    drawer.upload_texture(texture)
+
+    def _recompile_physics(self) -> None:
+        if self._physics is not None:
+            self._physics.free()
+        self._physics = Physics.from_mjcf_model(self._task.root_entity.mjcf_model)
+        self._physics.legacy_step = self._legacy_step
 
     def _recompile_physics_and_update_observables(self) -> None:
         # Composer draws every camera here, once before the first reset; we must not (see above).

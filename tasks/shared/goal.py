@@ -25,12 +25,14 @@ class Goal:
         normal: Outward unit normal there, (3,); the tool's axis is its opposite.
         standoff_m: Distance that the tip keeps from the target along the normal (m).
         velocity: How fast the goal moves, (3,) m/s.
+        more_follow: Whether the arm goes on to another goal, of which nobody knows where it is.
     """
 
     target: FloatArray
     normal: FloatArray
     standoff_m: float = 0.0
     velocity: FloatArray = dataclasses.field(default_factory=lambda: np.zeros(3))
+    more_follow: bool = False
 
     @functools.cached_property
     def position(self) -> FloatArray:

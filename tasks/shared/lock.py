@@ -80,12 +80,21 @@ def digest(task: str) -> str:
     """
     if task in lock():
         return lock()[task].digest
-    known = registered().get(task)
-    if known is None or known.family.__module__.partition(".")[0] == "hvs_suite":
+    if is_own(task):
         raise LockError(
             f"task {task!r} is not in the version lock; certify it with 'hvs certify {task}'"
         )
-    return _computed_digest(known)
+    return _computed_digest(registered()[task])
+
+
+def is_own(task: str) -> bool:
+    """Whether a task belongs into this lock: one that no other package registers.
+
+    Args:
+        task: Name of a task.
+    """
+    known = registered().get(task)
+    return known is None or known.family.__module__.partition(".")[0] == "hvs_suite"
 
 
 @functools.cache

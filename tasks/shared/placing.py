@@ -124,6 +124,12 @@ class PlacingSpec(Spec):
             Metric(TILT, "deg", "tilt error", self.tilt_tolerance_deg),
         )
 
+    @property
+    def landing_metric(self) -> Metric | None:
+        """The lateral error where it has a bound of its own, else the position error."""
+        position, lateral, *_ = self.metrics
+        return position if lateral.bound is None else lateral
+
     def describe(self) -> Description:
         """The task in words."""
         parts = []

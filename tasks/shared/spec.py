@@ -9,13 +9,13 @@ means needs a new ``version``; ``tasks/lock.json`` holds the digests.
 import dataclasses
 import difflib
 import math
-import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 from hvs_suite.errors import OptionError
+from hvs_suite.tasks.shared import option_types
 from hvs_suite.tasks.shared.metric import Metric
 
 if TYPE_CHECKING:
@@ -247,6 +247,7 @@ class Spec(Timing, Cameras, Disturbances):
 
     def _check_timing(self) -> None:
         self._check("must be positive", lambda value: value > 0, "control_period_s")
+        self._check("must be at most 1", lambda value: value <= 1.0, "control_period_s")
         for name in ("hold_steps", "time_limit_steps"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} is {getattr(self, name)}; use a whole number from 1 up")
@@ -322,6 +323,16 @@ class Spec(Timing, Cameras, Disturbances):
         units = {metric.name: metric.unit for metric in self.metrics}
         return min(bound for name, bound in self.step_bounds.items() if units[name] == "mm")
 
+    @property
+    def fps(self) -> int:
+        """Control steps a second, to the nearest whole number."""
+        return round(1.0 / self.control_period_s)
+
+    @property
+    def landing_metric(self) -> Metric | None:
+        """The distance from the goal in its plane that counts; None where nothing lands."""
+        return None
+
     def instruction(self, scenario: "Scenario | None" = None) -> str:
         """The task as one sentence, identical in environment and dataset.
 
@@ -371,11 +382,6 @@ class Spec(Timing, Cameras, Disturbances):
         return observation_names(self.observations, tuple(self.further_observations))
 
     @property
-    def camera_names(self) -> tuple[str, ...]:
-        """Observations that are colour pictures, in order."""
-        return tuple(name for name in self.observed if name in CAMERA_NAMES)
-
-    @property
     def scene_fields(self) -> tuple[str, ...]:
         """Names of the fields that shape the scene; see `scene`."""
         return tuple(
@@ -394,17 +400,54 @@ class Spec(Timing, Cameras, Disturbances):
         Raises:
             OptionError: An option does not exist or its value makes no sense.
         """
-        fields = {field.name for field in dataclasses.fields(self)} - {"name", "version"}
         for name in options:
-            if name not in fields:
-                close = difflib.get_close_matches(name, sorted(fields), n=2)
-                hint = f"; did you mean {' or '.join(close)}?" if close else ""
-                raise OptionError(f"{self.name} has no option {name!r}{hint}")
+            self._check_option(name)
         values: dict[str, Any] = {
             name: tuple(value) if isinstance(value, list) else value
             for name, value in options.items()
         }
         return dataclasses.replace(self, **values)
+
+    def options_from_text(self, words: Iterable[str]) -> dict[str, Any]:
+        """Read options as a command line gives them.
+
+        Args:
+            words: Each ``name=value``, the value as the type of the option says; see
+                `option_types.from_text`.
+
+        Returns:
+            New values by field name; one that the spec has already is left out.
+
+        Raises:
+            OptionError: A word is none, an option does not exist, or its value makes no sense.
+        """
+        hints = typing.get_type_hints(type(self))
+        options: dict[str, Any] = {}
+        for word in words:
+            name, equals, text = word.partition("=")
+            name = name.strip()
+            if not equals:
+                raise OptionError(
+                    f"an option is given as name=value, such as time_limit_steps=40, not {word!r}"
+                )
+            self._check_option(name)
+            if name in options:
+                raise OptionError(f"option {name} is given twice; give it once")
+            options[name] = option_types.from_text(text, hints[name])
+        self.with_options(options)
+        return {name: v for name, v in options.items() if v != getattr(self, name)}
+
+    def _check_option(self, name: str) -> None:
+        """Refuse a name that is no option.
+
+        Raises:
+            OptionError: It is none; the text offers the nearest, or all.
+        """
+        names = sorted({field.name for field in dataclasses.fields(self)} - {"name", "version"})
+        if name not in names:
+            close = difflib.get_close_matches(name, names, n=2)
+            hint = f"did you mean {' or '.join(close)}?" if close else f"use {', '.join(names)}"
+            raise OptionError(f"{self.name} has no option {name!r}; {hint}")
 
 
 CAMERA_NAMES = ("eih", "eth")
@@ -454,31 +497,9 @@ def _check_types(spec: Spec) -> None:
     for field in dataclasses.fields(spec):
         value = getattr(spec, field.name)
         hint = hints[field.name]
-        if not _fits(value, hint):
-            wanted = hint.__name__ if isinstance(hint, type) else str(hint).replace("typing.", "")
+        if not option_types.fits(value, hint):
+            wanted = option_types.in_words(hint)
             raise OptionError(f"{field.name} is {value!r}, which is not {wanted}")
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    """Whether a value has a type, for the few kinds of types that variants use."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if origin is Literal:
-        return value in arguments
-    if origin in (typing.Union, types.UnionType):
-        return any(_fits(value, choice) for choice in arguments)
-    if origin is tuple:
-        if not isinstance(value, tuple):
-            return False
-        if arguments[-1] is Ellipsis:
-            return all(_fits(item, arguments[0]) for item in value)
-        return len(value) == len(arguments) and all(map(_fits, value, arguments))
-    if hint is float:
-        return (
-            isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-        )
-    if hint is int:
-        return isinstance(value, int) and not isinstance(value, bool)
-    return isinstance(value, hint)
 
 
 def _check_joints(start: tuple[float, ...]) -> None:

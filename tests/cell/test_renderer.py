@@ -105,6 +105,29 @@ def test_all_who_draw_in_a_process_get_their_own_picture_in_any_order(
         np.testing.assert_array_equal(env.reset(scenario=1).observation["eth"], ours)
 
 
+def test_others_may_close_what_they_drew_with(alone: dict[Any, Any]) -> None:
+    """MuJoCo's own renderer leaves no context current, and dm_control does not hear of it."""
+    with hvs_suite.load("align-easy", split="test", observations="state") as env:
+        env.reset(scenario=1)
+        for _ in range(2):
+            picture = env.physics.render(240, 320)
+            np.testing.assert_array_equal(picture, alone[_physics_render])
+            with contextlib.ExitStack() as stack:
+                picture = _mujoco_renderer(env, stack)()
+            np.testing.assert_array_equal(picture, alone[_mujoco_renderer])
+
+
+def test_dm_control_s_pictures_show_the_textures_of_the_scenario() -> None:
+    with hvs_suite.load("align-hard", split="test", observations="state") as env:
+        env.reset(scenario=2)
+        alone = env.physics.render(60, 80)
+    with hvs_suite.load("align-hard", split="test", observations="state") as env:
+        env.reset(scenario=1)
+        assert (env.physics.render(60, 80) != alone).any()
+        env.reset(scenario=2)
+        np.testing.assert_array_equal(env.physics.render(60, 80), alone)
+
+
 def test_freeing_a_context_leaves_dm_control_s_pictures_alone(alone: dict[Any, Any]) -> None:
     with contextlib.ExitStack() as stack, hvs_suite.load("align-limit") as env:
         draw = _another_environment_of_dm_control(env, stack)

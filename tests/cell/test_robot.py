@@ -10,6 +10,7 @@ import pytest
 from dm_control import composer, mjcf
 
 from hvs_suite.cell import robot, shells
+from hvs_suite.cell.arm import Iiwa7
 from hvs_suite.cell.kinematics import Kinematics, kinematics, travel_time
 
 FloatArray = npt.NDArray[np.float64]
@@ -185,8 +186,8 @@ def test_links_two_apart_cannot_meet_so_leaving_them_out_loses_nothing() -> None
                 assert min(r.min_distance for r in geometry_data.distanceResults) > 1e-3
 
 
-def surface_physics(height_m: float) -> tuple[mjcf.Physics, robot.Iiwa7]:
-    arena, arm = composer.Arena(), robot.Iiwa7(shells=False)
+def surface_physics(height_m: float) -> tuple[mjcf.Physics, Iiwa7]:
+    arena, arm = composer.Arena(), Iiwa7(shells=False)
     arena.attach(arm)
     arena.mjcf_model.worldbody.add(
         "geom",
@@ -230,7 +231,7 @@ def test_folding_onto_the_base_is_a_contact_and_negative_clearance(model: mujoco
 
 
 def test_shells_are_light_and_take_no_part_in_physics() -> None:
-    physics = mjcf.Physics.from_mjcf_model(robot.Iiwa7().mjcf_model)
+    physics = mjcf.Physics.from_mjcf_model(Iiwa7().mjcf_model)
     bare = mujoco.MjModel.from_xml_string(robot.robot_mjcf())
     np.testing.assert_allclose(physics.model.body_mass, bare.body_mass, atol=0)
     np.testing.assert_allclose(physics.model.body_inertia, bare.body_inertia, atol=1e-15)

@@ -139,16 +139,13 @@ def curious(context: PolicyContext) -> Holds:
 
 def _truth() -> Iterator[str]:
     """Whatever tells more than the observations: all that Python shows to anybody who looks."""
-    simulator = (
-        "mujoco",
-        "dm_control",
-        "hvs_suite.tasks.shared.environment",
-        "hvs_suite.tasks.shared.scenario",
-    )
+    simulator = ("mujoco", "dm_control", "hvs_suite.tasks.shared.environment")
+    scenes = "hvs_suite.tasks.shared.scenario"
     yield from (name for name in sys.modules if name.startswith(simulator))
     for thing in gc.get_objects():
         kind = type(thing)
-        if str(getattr(kind, "__module__", "")).startswith(simulator):
+        modules = {str(getattr(base, "__module__", "")) for base in type.mro(kind)}
+        if any(module.startswith((*simulator, scenes)) for module in modules):
             yield f"a {kind.__module__}.{kind.__qualname__}"
         if kind is dict and type(thing.get("scenario")) is int:
             yield "a scenario's index"

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 import hvs_suite
-from hvs_suite.eval import action_log, protocol, result_file, trial, verification
-from hvs_suite.eval.result_file import EpisodeRow, Summary
+from hvs_suite.eval import protocol
+from hvs_suite.eval.scoring import action_log, result_file, trial, verification
+from hvs_suite.eval.scoring.result_file import EpisodeRow, Summary
 
 RESULTS = Path(__file__).parents[2] / "eval" / "results"
 SAMPLE = 20

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from hvs_suite.errors import OptionError
-from hvs_suite.eval import ablation_study
-from hvs_suite.eval.ablation_study import ABLATIONS, NO_DAGGER, WHOLE, Budget, run_study
+from hvs_suite.eval.studies import ablation
+from hvs_suite.eval.studies.ablation import ABLATIONS, NO_DAGGER, WHOLE, Budget, run_study
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "align-thesis"
 BUDGET = Budget(steps=2, dagger_rounds=1, dagger_frames=8, seed=0, episodes=2, workers=1)
@@ -31,9 +31,9 @@ def test_rows_lack_what_they_say_and_are_not_made_twice(tmp_path):
     assert run_study(SAMPLE, tmp_path, names, BUDGET, lambda *w: again.append(w[0])) == study
     assert reports
     assert not again
-    text = ablation_study.markdown(study)
+    text = ablation.markdown(study)
     assert all(row.name in text for row in study.rows[1:])
-    axes = ablation_study.draw(study).axes[0]
+    axes = ablation.draw(study).axes[0]
     assert [label.get_text() for label in axes.get_yticklabels()] == [
         row.name for row in study.rows[::-1]
     ]

@@ -8,9 +8,9 @@ import pytest
 from test_result_file import make_result, row
 
 from hvs_suite.cli import main
-from hvs_suite.errors import ResultError, UnknownTaskError
-from hvs_suite.eval import comparison, lerobot_import, result_file
-from hvs_suite.eval.result_file import Result, Summary
+from hvs_suite.errors import OptionError, ResultError, UnknownTaskError
+from hvs_suite.eval.scoring import comparison, lerobot_import, result_file
+from hvs_suite.eval.scoring.result_file import Result, Summary
 from hvs_suite.registry import find
 
 
@@ -148,7 +148,10 @@ def test_the_older_layout_of_the_file_is_read_too(tmp_path: Path) -> None:
     ("content", "reason"),
     [
         ("[1", "is not JSON"),
-        ("[1]", "is no eval_info.json"),
+        ("[1]", "holds list, not an object"),
+        ('{"per_episode": [null], "aggregated": {"pc_success": 0}}', "is no eval_info.json"),
+        (json.dumps(eval_info([True])).replace("1.0", "1e999", 1), "sum_rewards.0: .* finite"),
+        (json.dumps(eval_info([True])).replace("[1.0]", "[]", 1), "do not belong together"),
         ('{"per_task": 3}', "is no eval_info.json"),
         (json.dumps(eval_info([True, False]) | {"overall": None}), "is no eval_info.json"),
         ("{}", "is no eval_info.json"),
@@ -161,6 +164,13 @@ def test_what_cannot_be_true_is_not_imported(content: str, reason: str, tmp_path
     path.write_text(content)
     with pytest.raises(ResultError, match=reason):
         lerobot_import.read(path, task="align-easy", policy="act")
+
+
+def test_a_negative_seed_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "eval_info.json"
+    path.write_text(json.dumps(eval_info([True])))
+    with pytest.raises(OptionError, match="a seed is"):
+        lerobot_import.read(path, task="align-easy", policy="act", split="train", seed=-1)
 
 
 def test_a_task_that_does_not_exist_is_refused(tmp_path: Path) -> None:

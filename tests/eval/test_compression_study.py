@@ -15,9 +15,10 @@ from hvs_suite.cli.main import run
 from hvs_suite.datasets import publication, reader
 from hvs_suite.datasets.recompression import VideoCopy
 from hvs_suite.errors import DatasetError, OptionError, OutputError
-from hvs_suite.eval import compression_report, compression_study, study_training
-from hvs_suite.eval.compression_figures import Row, Study, Success
-from hvs_suite.eval.compression_study import Training, parse_setting, run_study
+from hvs_suite.eval import protocol
+from hvs_suite.eval.studies import compression, compression_report
+from hvs_suite.eval.studies.compression import Training, parse_setting, run_study
+from hvs_suite.eval.studies.compression_figures import Row, Study, Success
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "align-thesis"
 EIH, ETH = "observation.images.eih", "observation.images.eth"
@@ -117,8 +118,8 @@ def test_what_is_finished_is_not_done_again(
     def refuse(*_: Any) -> None:
         raise AssertionError("encoded again")
 
-    monkeypatch.setattr(compression_study, "convert_to_video", refuse)
-    monkeypatch.setattr(compression_study, "located", refuse)
+    monkeypatch.setattr(compression, "convert_to_video", refuse)
+    monkeypatch.setattr(compression, "located", refuse)
     assert study_of(studied[0], *SETTINGS) == studied[1]
     # A setting may be added, and only that one is work.
     with pytest.raises(AssertionError):
@@ -140,7 +141,7 @@ def test_a_killed_setting_begins_anew_and_the_finished_stay(
         if len(calls) == 1:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(compression_study, "convert_to_video", interrupt)
+    monkeypatch.setattr(compression, "convert_to_video", interrupt)
     with pytest.raises(KeyboardInterrupt):
         study_of(tmp_path, *SETTINGS[:2])
     again = study_of(tmp_path, *SETTINGS[:2])
@@ -189,7 +190,7 @@ def test_a_policy_learns_from_each_setting_and_is_paired_with_the_lossless_one(
     # What only training needed is gone, what was found is not sought again.
     assert not list(out.rglob("frames"))
     assert not list(out.rglob("cache"))
-    monkeypatch.setattr(study_training.protocol, "evaluate", None)
+    monkeypatch.setattr(protocol, "evaluate", None)
     assert study_of(out, "h264:30", training=training) == found
 
 

@@ -6,7 +6,7 @@ from test_result_file import row
 import hvs_suite
 from hvs_suite.cli.main import run
 from hvs_suite.eval import protocol
-from hvs_suite.eval.failures import Cause, cause_of, markdown, sort_failures
+from hvs_suite.eval.studies.failures import Cause, cause_of, markdown, sort_failures
 
 TASK = "align-easy"
 

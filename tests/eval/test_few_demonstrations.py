@@ -11,8 +11,8 @@ import pytest
 
 from hvs_suite.cli.main import run
 from hvs_suite.errors import OptionError, OutputError
-from hvs_suite.eval import few_demonstrations_report
-from hvs_suite.eval.few_demonstrations import (
+from hvs_suite.eval.studies import few_demonstrations_report
+from hvs_suite.eval.studies.few_demonstrations import (
     BASE,
     FINETUNED,
     IMITATED,
@@ -165,7 +165,7 @@ def test_its_processes_end_with_a_study_that_is_killed(tmp_path):
     script = (
         "import os, signal\n"
         "from pathlib import Path\n"
-        "from hvs_suite.eval.few_demonstrations import Budget, run_study\n"
+        "from hvs_suite.eval.studies.few_demonstrations import Budget, run_study\n"
         "def stop(*words): os.kill(os.getpid(), signal.SIGKILL)\n"
         f"run_study(Path({str(SAMPLE)!r}), Path({str(tmp_path)!r}), [3], {endless}, stop)\n"
     )

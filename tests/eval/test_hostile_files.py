@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from hvs_suite.cli import main
-from hvs_suite.eval import result_file
+from hvs_suite.eval.scoring import result_file
 
 RESULTS = Path(__file__).parents[2] / "eval" / "results"
 
@@ -70,6 +70,12 @@ def huge(path: Path) -> None:
         file.truncate(2**40)
 
 
+def many_of_the_same(content: dict[str, Any]) -> None:
+    """Columns of one value each, for as many rows as anybody likes."""
+    columns, content["summary"]["n_episodes"] = content["episodes"], 100_000
+    columns["errors"] = columns["settled"]["errors"] = {f"m{n}": 1.0 for n in range(40)}
+
+
 RESULT_FILES: dict[str, tuple[Callable[[Path], None], str]] = {
     "a pipe": (pipe, "no regular file"),
     "a terabyte": (huge, "at most"),
@@ -81,6 +87,7 @@ RESULT_FILES: dict[str, tuple[Callable[[Path], None], str]] = {
     "not a number": (written(b'{"schema_version": NaN}'), "is not JSON"),
     "an infinite number": (without_end, "holds a number without bounds"),
     "a schema of escapes": (written(b'{"schema_version": "\\u001b[31m"}'), r"\x1b"),
+    "rows out of nothing": (altered(many_of_the_same), "more than 500,000 values"),
     "a key of escapes": (altered(lambda c: c["metadata"].update({"\x1b\n": 1})), r"\x1b"),
 }
 

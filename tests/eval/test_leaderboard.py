@@ -15,20 +15,11 @@ from forgeries import with_errors
 from test_result_file import make_result, of_rows, row
 
 from hvs_suite.errors import OptionError, OutputError, ResultError
-from hvs_suite.eval import (
-    board_clips,
-    board_matrix,
-    board_plots,
-    board_replays,
-    board_tables,
-    leaderboard,
-    protocol,
-    result_file,
-    submission,
-    verification,
-)
-from hvs_suite.eval.board_page import page
-from hvs_suite.eval.board_tables import Entry
+from hvs_suite.eval import leaderboard, protocol
+from hvs_suite.eval.board import clips, matrix, plots, replay_check, submission, tables
+from hvs_suite.eval.board.page import page
+from hvs_suite.eval.board.tables import Entry
+from hvs_suite.eval.scoring import result_file, verification
 
 ROOT = Path(__file__).parents[2]
 COMMITTED = ROOT / "eval"
@@ -107,8 +98,8 @@ def test_a_rebuild_changes_nothing_and_draws_nothing(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = content_of(folder)
-    monkeypatch.setattr(board_clips, "_draw", None)
-    monkeypatch.setattr(board_replays.verification, "verify", None)
+    monkeypatch.setattr(clips, "_draw", None)
+    monkeypatch.setattr(replay_check.verification, "verify", None)
     build(folder, replay=1)
     assert content_of(folder) == before
 
@@ -116,7 +107,7 @@ def test_a_rebuild_changes_nothing_and_draws_nothing(
 def test_clips_show_the_middle_success_and_the_middle_failure() -> None:
     rows = [row(k, success=k != 3 and k < 5, error=float(k)) for k in range(8)]
     result = of_rows(rows)
-    assert [(kind, r.scenario) for kind, r in board_clips.choose(result)] == [
+    assert [(kind, r.scenario) for kind, r in clips.choose(result)] == [
         ("success", 1),
         ("failure", 5),
     ]
@@ -125,20 +116,20 @@ def test_clips_show_the_middle_success_and_the_middle_failure() -> None:
 def test_each_entry_has_the_clips_it_can_have(made: Path) -> None:
     from PIL import Image
 
-    clips = sorted((made / "out" / "clips").rglob("*.avif"))
-    assert [path.name.rpartition(".")[0].rpartition(".")[0] for path in clips] == [
+    films = sorted((made / "out" / "clips").rglob("*.avif"))
+    assert [path.name.rpartition(".")[0].rpartition(".")[0] for path in films] == [
         "align-easy.success",
         "align-fixed.success",
         "align-fixed.failure",
     ]
-    with Image.open(clips[0]) as film:
-        assert film.size == board_clips.SIZE
+    with Image.open(films[0]) as film:
+        assert film.size == clips.SIZE
         assert film.n_frames == 21
         # The arm moves: first and last frame are not the same picture.
         first = film.convert("RGB").tobytes()
         film.seek(20)
         assert film.convert("RGB").tobytes() != first
-    assert all(path.stat().st_size < 30_000 for path in clips)
+    assert all(path.stat().st_size < 30_000 for path in films)
 
 
 def test_a_clip_that_belongs_to_no_result_is_removed(folder: Path) -> None:
@@ -221,7 +212,7 @@ def test_a_page_of_six_tasks_and_eight_policies_stays_small() -> None:
         Entry(
             f"policy-{k}", made_up("p", task=task).result.model_copy(update={"episodes": rows}), 9
         )
-        for task in board_tables.TASKS
+        for task in tables.TASKS
         if task.startswith("align-")
         for k in range(8)
     ]
@@ -230,7 +221,7 @@ def test_a_page_of_six_tasks_and_eight_policies_stays_small() -> None:
 
 def test_the_curve_of_tolerance_is_the_rows_own() -> None:
     entry = made_up("a")
-    plot = board_plots.tolerance_plot([entry], {"a": 0})
+    plot = plots.tolerance_plot([entry], {"a": 0})
     # Four of five settle somewhere; the fifth collided, and no tolerance makes that a success.
     [line] = re.findall(r'class="line" d="M([^"]*)"', plot)
     x, y = (float(part) for part in line.split("L")[-1].split())
@@ -243,7 +234,7 @@ def test_landings_stand_where_the_flange_stood() -> None:
         row(2, success=False, error=9.0, settled={"x_mm": -90.0, "y_mm": 0.0}),
         row(3, success=False, error=9.0, settled={"x_mm": 0.0, "y_mm": -10.0}),
     ]
-    plot = board_plots.landing_plot(rows, 10.0, 5.0, "landings")
+    plot = plots.landing_plot(rows, 10.0, 5.0, "landings")
     assert '<path class="hit" d="M150 75h0"/>' in plot
     assert '<path class="lost" d="M100 200h0"/>' in plot
     assert 'class="miss"' not in plot
@@ -253,7 +244,7 @@ def test_landings_stand_where_the_flange_stood() -> None:
 @pytest.mark.parametrize(("error", "radius"), [(0.0, 0.001), (0.9, 1), (1.1, 2), (430.0, 500)])
 def test_the_landing_picture_has_a_round_size(error: float, radius: float) -> None:
     rows = [row(k, success=False, error=error, settled={"x_mm": error}) for k in range(5)]
-    assert board_plots.landing_radius(rows) == pytest.approx(radius)
+    assert plots.landing_radius(rows) == pytest.approx(radius)
 
 
 def test_the_comparison_is_paired_and_corrected() -> None:
@@ -272,7 +263,7 @@ def test_the_comparison_is_paired_and_corrected() -> None:
         ]
         return Entry(policy, make_result().model_copy(update={"episodes": rows}), 1)
 
-    table = board_matrix.matrix([entry("a", 20), entry("b", 11), entry("c", 10)])
+    table = matrix.matrix([entry("a", 20), entry("b", 11), entry("c", 10)])
     # a against b: nine discordant pairs, p = 2/2^9, times 2 by Holm; b against c: one pair.
     assert "+45.0<small>p = 0.008</small>" in table
     assert "\N{MINUS SIGN}45.0<small>p = 0.008</small>" in table
@@ -282,7 +273,7 @@ def test_the_comparison_is_paired_and_corrected() -> None:
 
 
 def test_steps_are_compared_with_the_experts_on_what_both_solve(made: Path) -> None:
-    entries = board_tables.make_entries(submission.check(made / "results", draft=True))
+    entries = tables.make_entries(submission.check(made / "results", draft=True))
     assert [(e.policy, e.steps_over_expert) for e in entries] == [
         ("expert", 1.0),
         ("expert", 1.0),
@@ -294,13 +285,13 @@ def test_a_hostile_name_stays_text() -> None:
     name = '<img onerror=alert(1)>|"'
     entries = [made_up(name), made_up("other")]
     assert "<img" not in page(entries)
-    assert "<img" not in board_tables.markdown(entries)
-    assert "(1)&#62;&#124;" in board_tables.markdown(entries)
+    assert "<img" not in tables.markdown(entries)
+    assert "(1)&#62;&#124;" in tables.markdown(entries)
 
 
 def test_what_is_not_seen_of_a_name_is_shown() -> None:
     name = "a\u202eb\x1b[31m\n\ud800"
-    for text in (page([made_up(name)]), board_tables.markdown([made_up(name)])):
+    for text in (page([made_up(name)]), tables.markdown([made_up(name)])):
         assert "\\u202eb\\x1b" in html.unescape(text)
         assert "\u202e" not in text
         assert "\x1b" not in text
@@ -320,7 +311,7 @@ def test_what_is_not_seen_of_a_name_is_shown() -> None:
     ],
 )
 def test_figures_keep_the_digits_that_matter(value: float | None, text: str) -> None:
-    assert board_tables.figure(value) == text
+    assert tables.figure(value) == text
 
 
 def test_no_results_say_how_to_make_one(tmp_path: Path) -> None:
@@ -391,7 +382,7 @@ def another_split(results: Path) -> str:
 
 def changed_task(results: Path) -> str:
     alter(results / "zero" / "align-fixed.json", options={"hold_steps": 2})
-    return r"task was changed \(hold_steps\)"
+    return r"task was changed \(hold_steps=2\)"
 
 
 def duplicate(results: Path) -> str:
@@ -609,7 +600,7 @@ def test_the_committed_board_is_what_the_committed_results_give(
     ledger = tmp_path.with_name("replays.json")
     # They are played again one by one in test_submission; here it is what is drawn of them.
     monkeypatch.setattr(
-        board_replays.verification, "verify", lambda path, *, sample, nonce: played_well(path)
+        replay_check.verification, "verify", lambda path, *, sample, nonce: played_well(path)
     )
     leaderboard.build(COMMITTED / "results", tmp_path, ledger=ledger, say=said.append)
     # No clip was missing either: they are committed with the board.
@@ -619,4 +610,4 @@ def test_the_committed_board_is_what_the_committed_results_give(
 
 def played_well(path: Path) -> verification.Verdict:
     n = result_file.load(path).summary.n_episodes
-    return verification.Verdict(n, min(n, board_replays.SAMPLE), 0, None, {})
+    return verification.Verdict(n, min(n, replay_check.SAMPLE), 0, None, {})

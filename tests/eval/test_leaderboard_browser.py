@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 from test_result_file import TOLERANCES, make_result, row
 
-from hvs_suite.eval import board_clips, result_file
-from hvs_suite.eval.board_page import page
-from hvs_suite.eval.board_tables import Entry
+from hvs_suite.eval.board import clips
+from hvs_suite.eval.board.page import page
+from hvs_suite.eval.board.tables import Entry
+from hvs_suite.eval.scoring import result_file
 
 pytestmark = pytest.mark.browser
 
@@ -36,7 +37,7 @@ def film() -> bytes:
     """Two frames of a clip's size."""
     from PIL import Image
 
-    first, second = (Image.new("RGB", board_clips.SIZE, colour) for colour in ("red", "blue"))
+    first, second = (Image.new("RGB", clips.SIZE, colour) for colour in ("red", "blue"))
     buffer = io.BytesIO()
     first.save(buffer, format="AVIF", save_all=True, append_images=[second], duration=100)
     return buffer.getvalue()
@@ -59,14 +60,14 @@ def browser() -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def board(tmp_path_factory: pytest.TempPathFactory) -> Path:
     entries = [entry(policy, task) for task in ("align-easy", "align-hard") for policy in WINS]
-    clips = {
+    films = {
         (e.policy, e.result.summary.task): [
-            board_clips.Clip(kind, r, film()) for kind, r in board_clips.choose(e.result)
+            clips.Clip(kind, r, film()) for kind, r in clips.choose(e.result)
         ]
         for e in entries
     }
     path = tmp_path_factory.mktemp("board") / "leaderboard.html"
-    path.write_text(page(entries, clips), encoding="utf-8")
+    path.write_text(page(entries, films), encoding="utf-8")
     return path
 
 

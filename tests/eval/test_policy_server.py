@@ -24,15 +24,9 @@ from websockets.sync.server import serve
 import hvs_suite
 from hvs_suite.cli import main
 from hvs_suite.errors import OptionError, PolicyError, ServerError
-from hvs_suite.eval import (
-    policy_server,
-    policy_session,
-    progress_file,
-    protocol,
-    remote_policy,
-    result_file,
-    wire,
-)
+from hvs_suite.eval import protocol
+from hvs_suite.eval.scoring import progress_file, result_file
+from hvs_suite.eval.serving import policy_server, policy_session, remote_policy, wire
 from hvs_suite.rollout import run_episode
 
 TASK = "align-thesis"

@@ -7,7 +7,8 @@ import pytest
 
 from hvs_suite.cli import main
 from hvs_suite.errors import OptionError, PolicyError, ScenarioError, UnknownTaskError
-from hvs_suite.eval import protocol, result_file
+from hvs_suite.eval import protocol
+from hvs_suite.eval.scoring import result_file
 from hvs_suite.registry import TASKS
 
 

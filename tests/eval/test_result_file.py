@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from hvs_suite.errors import OutputError, ResultError
-from hvs_suite.eval import result_file
+from hvs_suite.eval.scoring import result_file
 
 TOLERANCES = {"position_error_mm": 5.0, "tilt_error_deg": 5.0}
 

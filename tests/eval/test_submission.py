@@ -12,7 +12,9 @@ from forgeries import rewrite, with_log
 
 from hvs_suite.cli import main
 from hvs_suite.errors import ResultError
-from hvs_suite.eval import action_log, ours, protocol, result_file, submission, verification
+from hvs_suite.eval import protocol
+from hvs_suite.eval.board import ours, submission
+from hvs_suite.eval.scoring import action_log, result_file, verification
 
 RESULTS = Path(__file__).parents[2] / "eval" / "results"
 COMMITTED = sorted(RESULTS.rglob("*.json"))
@@ -75,6 +77,11 @@ def a_step_of_its_own(folder: Path) -> str:
     return copied(folder, lambda actions: np.concatenate([actions[:-1], -actions[-1:]]))
 
 
+def its_own_once_the_goal_is_held(folder: Path) -> str:
+    # The expert takes up to 14 of the 20 steps; what it did later gave no score.
+    return copied(folder, lambda actions: np.concatenate([actions[:14], actions[14:] + 0.01]))
+
+
 def stored_uncompressed(folder: Path) -> str:
     copied(folder, lambda actions: actions)
     path = folder / "mine" / "align-fixed.json"
@@ -116,6 +123,13 @@ def bears(name: str) -> Callable[[Path], str]:
         return "is a policy of the suite" if name == "expert" else f"'{name}' passes for 'expert'"
 
     return bear
+
+
+def bears_another_s_name(folder: Path) -> str:
+    made_to_wander(folder)
+    (folder / "mine").rename(folder / "robo")
+    shutil.copytree(folder / "robo", folder / "r\u043ebo")
+    return "passes for"
 
 
 def the_experts_own_elsewhere(folder: Path) -> str:
@@ -193,6 +207,7 @@ def another_split(folder: Path) -> str:
         shifted_by_a_rounding,
         shifted_out_of_range,
         a_step_of_its_own,
+        its_own_once_the_goal_is_held,
         stored_uncompressed,
         calls_itself_builtin,
         calls_itself("expert"),
@@ -201,6 +216,8 @@ def another_split(folder: Path) -> str:
         bears("expert"),
         bears("Expert"),
         bears("e\u0445pert"),
+        bears("e\u00d7pert"),
+        bears_another_s_name,
         the_experts_own_elsewhere,
         a_link,
         a_linked_log,

@@ -79,7 +79,7 @@ def test_wheel_holds_each_room_as_a_real_folder_with_every_module(wheel_folder, 
 def test_wheel_holds_the_data_files_of_each_room(wheel_folder, room):
     expected = {
         p.relative_to(ROOT / room)
-        for suffix in ("json", "safetensors")
+        for suffix in ("css", "js", "json", "md", "safetensors")
         for p in (ROOT / room).rglob(f"*.{suffix}")
     }
     packed = wheel_folder / "hvs_suite" / room

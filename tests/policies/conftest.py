@@ -25,7 +25,7 @@ def large_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def checkpoint(large_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Checkpoint that fits the easy tasks, trained for two steps."""
-    from hvs_suite.policies.pretrain import pretrain
+    from hvs_suite.policies.imitation.pretrain import pretrain
 
     out = tmp_path_factory.mktemp("checkpoint")
     pretrain(large_dataset, out, steps=2, batch_size=4)

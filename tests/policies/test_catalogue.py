@@ -10,7 +10,7 @@ import pytest
 from hvs_suite.errors import PolicyError, UnknownTaskError
 from hvs_suite.policies import catalogue
 from hvs_suite.policies.catalogue import policy_factory
-from hvs_suite.policies.checkpoint import CheckpointPolicy
+from hvs_suite.policies.checkpoints.loading import CheckpointPolicy
 from hvs_suite.registry import TASKS
 
 

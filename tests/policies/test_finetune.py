@@ -19,7 +19,7 @@ from hvs_suite.cli.main import run
 from hvs_suite.datasets.expert import Expert
 from hvs_suite.errors import OptionError, PolicyError
 from hvs_suite.gym import TaskEnv
-from hvs_suite.policies.checkpoint import CheckpointPolicy
+from hvs_suite.policies.checkpoints.loading import CheckpointPolicy
 from hvs_suite.policies.finetune.folding import load_base, with_residual, write_folded
 from hvs_suite.policies.finetune.outlook import Outlook
 from hvs_suite.policies.finetune.residual_td3 import WARM_UP_UPDATES, ResidualPolicy
@@ -32,7 +32,7 @@ from hvs_suite.policies.finetune.stage import (
 )
 from hvs_suite.policies.finetune.training import finetune
 from hvs_suite.policies.hvs.network import CONTROL_PERIOD_S, SET_POINT
-from hvs_suite.policies.pretrain import pretrain
+from hvs_suite.policies.imitation.pretrain import pretrain
 from hvs_suite.policies.rl.evaluation import Evaluation, fallen
 from hvs_suite.policies.rl.journal import Journal
 from hvs_suite.rollout import run_episode
@@ -117,7 +117,7 @@ def sent(folder):
 def test_a_residual_adds_nothing_at_first_and_no_more_than_its_bound_ever(base, tmp_path):
     plain = load_base(base)
     network = with_residual(plain, hidden=16, bound=0.6)
-    write_folded(base, network, tmp_path / "folded")
+    write_folded(base, network, tmp_path / "folded", hvs_suite.TASKS["align-easy"])
     np.testing.assert_allclose(sent(tmp_path / "folded"), sent(base), atol=1e-6)
     with torch.no_grad():
         network.residual[-2].bias.fill_(100.0)
@@ -321,7 +321,7 @@ def test_scenes_that_were_lost_come_again_in_turn_between_new_ones():
     played = journal.unwrapped.played
     assert played == [0, 1, 2, 2, 3, 3, 4, 2, 5]
     restored = Journal(LoseThose({2, 3}), seed=0, lost_share=0.5)
-    restored.go_to(journal.place())
+    restored.load_state_dict(journal.state_dict())
     for each in (journal, restored):
         each.reset()
     assert restored.unwrapped.played == journal.unwrapped.played[9:]
@@ -360,9 +360,7 @@ def test_a_fine_tuned_policy_is_shipped_like_any_other(whole, tmp_path):
      ([0.9, 0.6, 0.88], False)],
 )  # fmt: skip
 def test_success_has_fallen_where_chance_does_not_explain_it(rates, expected):
-    evaluations = [
-        Evaluation(i, i, 100, 0.0, 1.0, rate, 0.0, 0.0, 0.0) for i, rate in enumerate(rates)
-    ]
+    evaluations = [Evaluation(i, i, 100, 0.0, 1.0, rate, 0.0, {}) for i, rate in enumerate(rates)]
     assert fallen(evaluations) is expected
 
 
@@ -371,9 +369,9 @@ def pretend(monkeypatch, rates):
     coming = iter(rates)
 
     def evaluate(self, policy, env_steps, updates, clip=None, on_episode=None):
-        return Evaluation(env_steps, updates, 100, 0.0, 1.0, next(coming), 0.0, 0.0, 0.0)
+        return Evaluation(env_steps, updates, 100, 0.0, 1.0, next(coming), 0.0, {})
 
-    monkeypatch.setattr("hvs_suite.policies.rl.evaluation.Examiner.evaluate", evaluate)
+    monkeypatch.setattr("hvs_suite.policies.rl.evaluation.Evaluator.evaluate", evaluate)
 
 
 @pytest.mark.parametrize(("success", "keeps"), [(0.8, False), (0.9, True)])
@@ -440,3 +438,9 @@ def test_what_cannot_be_fine_tuned_is_refused(whole, base, tmp_path, capsys):
     assert run(["finetune", *words]) == 2
     assert "does not fit align-easy" in capsys.readouterr().err
     assert not (tmp_path / "cli").exists()
+
+
+def test_the_options_of_the_run_are_in_checkpoint_and_notes(whole):
+    out, _, _ = whole
+    assert json.loads((out / "config.json").read_text())["options"] == OPTIONS
+    assert json.loads((out / "train_config.json").read_text())["settings"]["options"] == OPTIONS

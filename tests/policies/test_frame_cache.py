@@ -5,7 +5,7 @@ import mmap
 import numpy as np
 import pytest
 
-from hvs_suite.policies.frame_cache import open_frames, read_rows
+from hvs_suite.policies.imitation.frame_cache import open_frames, read_rows
 
 N, SIDE = 50, 37
 

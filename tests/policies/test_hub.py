@@ -15,8 +15,8 @@ from hub_server import running_hub
 
 from hvs_suite.cli import main
 from hvs_suite.errors import PolicyError
-from hvs_suite.policies import hub
 from hvs_suite.policies.catalogue import policy_factory
+from hvs_suite.policies.checkpoints import hub
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
@@ -54,7 +54,7 @@ def test_what_was_never_fetched_is_refused_in_one_line_with_2(
 def test_no_code_and_no_pickle_is_ever_fetched(tmp_path: Path) -> None:
     plain = {"config.json", "model.safetensors", "train/config.json"}
     other = {"modeling.py", "pytorch_model.bin", "model.pkl", "train/optimizer.pt", "README.md"}
-    program = "from hvs_suite.policies import hub; print(hub.fetch('someone/servoing'))"
+    program = "from hvs_suite.policies.checkpoints import hub; print(hub.fetch('someone/servoing'))"
     with running_hub() as server:
         server.files = {name: name.encode() for name in plain | other}
         done = subprocess.run(

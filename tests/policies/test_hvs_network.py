@@ -247,7 +247,7 @@ def test_the_network_needs_no_lerobot(tmp_path: Path):
     import sys
 
     code = (
-        "import sys; import hvs_suite.policies.checkpoint, hvs_suite.policies.catalogue;"
+        "import sys; import hvs_suite.policies.checkpoints.loading, hvs_suite.policies.catalogue;"
         "sys.exit(any(m.split('.')[0] in ('lerobot', 'datasets') for m in sys.modules))"
     )
     assert subprocess.run([sys.executable, "-c", code], cwd=tmp_path).returncode == 0

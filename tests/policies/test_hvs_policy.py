@@ -4,7 +4,7 @@ import miniature
 import pytest
 import torch
 
-from hvs_suite.policies.checkpoint import CheckpointPolicy
+from hvs_suite.policies.checkpoints.loading import CheckpointPolicy
 from hvs_suite.registry import TASKS
 
 

@@ -10,13 +10,16 @@ from pathlib import Path
 import miniature
 import numpy as np
 import pytest
+import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from hvs_suite.cli import main
 from hvs_suite.errors import OutputError, PolicyError
-from hvs_suite.policies.curves import Curves
-from hvs_suite.policies.frame_cache import new_frames
-from hvs_suite.policies.pretrain import pretrain
+from hvs_suite.policies.imitation.frame_cache import cached_frames, new_frames
+from hvs_suite.policies.imitation.pretrain import pretrain
+from hvs_suite.policies.imitation.state import Counters, load_state, save_state
+from hvs_suite.policies.training import run_folder
+from hvs_suite.policies.training.curves import Curves
 
 RUN = {"steps": 6, "batch_size": 8, "seed": 3, "checkpoint_period_s": 0.0}
 WORDS = "pretrain --data {data} --out {out} --steps 6 --seed 3"
@@ -185,3 +188,59 @@ def test_a_run_that_comes_apart_keeps_its_last_good_weights(dataset, tmp_path, m
         pretrain(dataset, out, **RUN)
     for name in ("model.safetensors", "training/state.safetensors"):
         assert (out / name).read_bytes() == (tmp_path / "before" / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    "content", ["", "null", "[" * 100_000, "{}", '{"settings": null}', '{"settings": [1]}']
+)
+def test_a_run_whose_settings_are_damaged_is_left_alone(tmp_path, content):
+    (tmp_path / run_folder.CONFIG).write_text(content)
+    with pytest.raises(OutputError) as refusal, run_folder.claimed(tmp_path, {"seed": 3}):
+        pytest.fail("it was claimed")
+    assert len(str(refusal.value).splitlines()) == 1
+    assert (tmp_path / run_folder.CONFIG).read_text() == content
+
+
+def pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+SPOILT = {
+    "empty": lambda path: path.write_bytes(b""),
+    "cut": lambda path: os.truncate(path, path.stat().st_size // 2),
+    "another": lambda path: np.save(path.open("wb"), np.zeros(3, np.uint8)),
+    "deep": lambda path: path.write_bytes(b"[" * 100_000),
+    "pipe": pipe,
+}
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("spoil", SPOILT.values(), ids=SPOILT)
+def test_frames_that_were_spoilt_are_decoded_anew(dataset, tmp_path, spoil):
+    shape, n = (28, 28, 3), 40
+    camera = "observation.images.eih"
+    frames = np.array(cached_frames(dataset, camera, shape, n, tmp_path))
+    for path in (tmp_path / f"{camera}.npy", tmp_path / f"{camera}.json"):
+        spoil(path)
+        again = cached_frames(dataset, camera, shape, n, tmp_path)
+        np.testing.assert_array_equal(again, frames)
+        path.unlink()
+        path.mkdir()
+        with pytest.raises(OutputError, match="cannot"):
+            cached_frames(dataset, camera, shape, n, tmp_path)
+        path.rmdir()
+        cached_frames(dataset, camera, shape, n, tmp_path)
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize("spoil", SPOILT.values(), ids=SPOILT)
+def test_a_state_that_was_spoilt_is_not_resumed(tmp_path, spoil):
+    layer = torch.nn.Linear(1, 1)
+    optimizer = torch.optim.AdamW(layer.parameters())
+    path = tmp_path / "state.safetensors"
+    save_state(path, layer, optimizer, Counters())
+    spoil(path)
+    with pytest.raises(OutputError) as refusal:
+        load_state(path, layer, optimizer)
+    assert len(str(refusal.value).splitlines()) == 1

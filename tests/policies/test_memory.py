@@ -11,7 +11,7 @@ from hvs_suite.datasets.expert import Expert
 from hvs_suite.datasets.looking import LOOK_OUT_RAD
 from hvs_suite.policies.hvs.geometry import Calibration, calibrate, flange_motion
 from hvs_suite.policies.hvs.network import HEIGHT_SUMS, SET_POINT, HvsNetwork, Shape, Sighting
-from hvs_suite.policies.remembered import remembered
+from hvs_suite.policies.imitation.remembered import remembered
 
 CAMERAS = {"eih": (3, 28), "eth": (3, 28)}
 PLACE = torch.tensor([[0.4, 0.3, 0.0, 1.0]])

@@ -6,10 +6,17 @@ import pytest
 
 import hvs_suite
 from hvs_suite.cli.main import parse, run
-from hvs_suite.policies.recipe import recipe, trained_on
+from hvs_suite.policies.recipe import HERE, recipe, trained_on
+
+RECIPES = {path.stem for path in (HERE / "recipes").iterdir()}
 
 
-@pytest.mark.parametrize("task", sorted(hvs_suite.TASKS))
+def test_weights_are_shipped_with_a_recipe_each():
+    shipped = {path.name for path in (HERE / "pretrained").iterdir()}
+    assert shipped == RECIPES <= set(hvs_suite.TASKS)
+
+
+@pytest.mark.parametrize("task", sorted(t for t in hvs_suite.TASKS if trained_on(t) in RECIPES))
 def test_a_recipe_trains_on_what_it_records(task):
     plan = recipe(task)
     record, pretrain = parse(plan.record), parse(plan.pretrain)
@@ -31,7 +38,12 @@ def test_a_shared_policy_sees_what_its_own_task_shows(task):
 
 
 @pytest.mark.parametrize(
-    "words", [["--task", "align-nothing"], ["--task", "align-easy", "--episodes", "0"]]
+    "words",
+    [
+        ["--task", "align-nothing"],
+        ["--task", "align-easy", "--episodes", "0"],
+        ["--task", "track-line"],
+    ],
 )
 def test_nonsense_is_one_line(words, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

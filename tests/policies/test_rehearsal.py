@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from hvs_suite.policies.demonstrations import Demonstrations, read_manifest
+from hvs_suite.policies.hvs.dataset import read_manifest
 from hvs_suite.policies.hvs.network import Sighting
 from hvs_suite.policies.hvs.rehearsal import drawn_sightings
-from hvs_suite.policies.pretrain import pretrain
+from hvs_suite.policies.imitation.demonstrations import Demonstrations
+from hvs_suite.policies.imitation.pretrain import pretrain
 
 
 def truths(n, seed):
@@ -60,7 +61,7 @@ def test_where_no_eye_tells_the_truth_stands_in(visible):
 
 
 def test_it_teaches_the_head_and_leaves_the_eyes_alone(dataset, tmp_path):
-    from hvs_suite.policies.pretrain_settings import Settings, new_policy
+    from hvs_suite.policies.imitation.settings import Settings, new_policy
 
     manifest = read_manifest(dataset)
     settings = Settings(

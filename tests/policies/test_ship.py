@@ -10,11 +10,11 @@ import pytest
 from hub_server import running_hub
 
 from hvs_suite.cli.main import run
-from hvs_suite.policies import card, checkpoint_files
 from hvs_suite.policies.catalogue import policy_factory
+from hvs_suite.policies.checkpoints import card, files
 
 TOKEN = "hf_" + "NeverToBeSeen" * 2
-FILES = {card.CARD, *checkpoint_files.FILES, *card.TRAINING_FILES}
+FILES = {card.CARD, *files.FILES, *card.TRAINING_FILES}
 
 
 def files_below(folder: Path) -> set[str]:
@@ -62,6 +62,24 @@ def test_the_hub_gets_every_file_and_nobody_sees_the_token(checkpoint, tmp_path)
     assert created.get("private") or created.get("visibility") == "private"
     assert hub.authorizations - {None} == {f"Bearer {TOKEN}"}
     assert TOKEN not in done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda path: path.write_text("null"),
+        lambda path: path.write_text("[" * 100_000),
+        lambda path: (path.unlink(), path.symlink_to("/etc/hostname")),
+        lambda path: (path.unlink(), path.symlink_to("/dev/zero")),
+    ],
+    ids=["null", "deep", "link out", "device"],
+)
+def test_notes_of_a_strange_run_are_refused_in_one_line(checkpoint, tmp_path, capsys, spoil):
+    strange = tmp_path / "strange"
+    shutil.copytree(checkpoint, strange)
+    spoil(strange / "training" / "outcome.json")
+    assert run(["ship", str(strange), "--to-folder", str(tmp_path / "out")]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import hvs_suite
-from hvs_suite.eval import provenance, result_file
+from hvs_suite.eval.scoring import provenance, result_file
 from hvs_suite.policies import catalogue
 from hvs_suite.policies.recipe import trained_on
 from hvs_suite.rollout import rollout

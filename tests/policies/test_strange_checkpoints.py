@@ -24,13 +24,14 @@ from safetensors.numpy import load_file, save_file
 
 from hvs_suite.cli import main
 from hvs_suite.errors import HvsError, PolicyError
-from hvs_suite.eval import action_log, protocol
-from hvs_suite.eval.provenance import file_hash
-from hvs_suite.policies import dagger, imported
+from hvs_suite.eval.scoring import action_log, contender
+from hvs_suite.eval.scoring.provenance import file_hash
+from hvs_suite.policies import imported
 from hvs_suite.policies.catalogue import checkpoint_folder, policy_factory
-from hvs_suite.policies.checkpoint_files import read_config, read_shapes
-from hvs_suite.policies.frame_cache import open_frames
-from hvs_suite.policies.training_state import load_state
+from hvs_suite.policies.checkpoints.files import read_config, read_shapes
+from hvs_suite.policies.imitation import dagger
+from hvs_suite.policies.imitation.frame_cache import open_frames
+from hvs_suite.policies.imitation.state import load_state
 from hvs_suite.registry import TASKS
 
 TASK = "align-easy"
@@ -144,7 +145,7 @@ def test_nobody_passes_such_a_checkpoint_on(
 
 
 def test_eyes_are_not_taken_from_such_a_checkpoint(strange: Path, tmp_path: Path) -> None:
-    from hvs_suite.policies.checkpoint import weights_digest
+    from hvs_suite.policies.checkpoints.loading import weights_digest
 
     with_step(strange, "preprocessor", payloads(tmp_path / "marker")["Popen"])
     # The first thing that pretraining asks of the folder.
@@ -171,7 +172,7 @@ def test_a_sound_checkpoint_of_the_hub_is_taken_through_its_links(
     strange: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spec = fetched(strange, tmp_path / "cache", monkeypatch)
-    policy_factory(spec, TASK)(SimpleNamespace(variant=TASKS[TASK]))
+    policy_factory(spec, TASK)(SimpleNamespace(spec=TASKS[TASK]))
 
 
 def config(**values: Any) -> Damage:
@@ -339,13 +340,13 @@ DAMAGES: dict[str, Damage] = {
 def test_a_damaged_checkpoint_is_refused_in_one_line(strange: Path, damage: str) -> None:
     DAMAGES[damage](strange)
     with pytest.raises(PolicyError) as refusal:
-        policy_factory(str(strange), TASK)(SimpleNamespace(variant=TASKS[TASK]))
+        policy_factory(str(strange), TASK)(SimpleNamespace(spec=TASKS[TASK]))
     assert len(str(refusal.value).splitlines()) == 1
     assert len(str(refusal.value)) < 600
 
 
 def test_what_was_not_damaged_is_taken(strange: Path) -> None:
-    policy_factory(str(strange), TASK)(SimpleNamespace(variant=TASKS[TASK]))
+    policy_factory(str(strange), TASK)(SimpleNamespace(spec=TASKS[TASK]))
     assert read_config(strange)["type"] == "hvs"
 
 
@@ -370,7 +371,7 @@ def test_notes_that_a_result_could_not_hold_are_refused_before_anything_is_playe
 ) -> None:
     (strange / "training" / "outcome.json").write_text(outcome)
     with pytest.raises(PolicyError, match="mend or remove") as refusal:
-        protocol.find(str(strange), TASK)
+        contender.find(str(strange), TASK)
     assert len(str(refusal.value).splitlines()) == 1
 
 
@@ -378,9 +379,9 @@ def test_notes_without_a_held_out_loss_are_taken(strange: Path) -> None:
     (strange / "training" / "outcome.json").write_text(
         '{"step": 7, "train_s": 1800.0, "held_out_loss": NaN}'
     )
-    contender = protocol.find(str(strange), TASK)
-    assert (contender.training_steps, contender.training_hours) == (7, 0.5)
-    assert contender.parameters == read_total(strange)
+    found = contender.find(str(strange), TASK)
+    assert (found.training_steps, found.training_hours) == (7, 0.5)
+    assert found.parameters == read_total(strange)
 
 
 def read_total(folder: Path) -> int:
@@ -477,7 +478,7 @@ def test_a_damaged_actor_is_refused_in_one_line(tmp_path: Path, values: dict[str
     (tmp_path / "config.json").write_text(json.dumps({**SAC, **values}))
     save_file({"mu.bias": np.zeros(7, np.float32)}, tmp_path / "model.safetensors")
     with pytest.raises(PolicyError) as refusal:
-        policy_factory(str(tmp_path), TASK)(SimpleNamespace(variant=TASKS[TASK]))
+        policy_factory(str(tmp_path), TASK)(SimpleNamespace(spec=TASKS[TASK]))
     assert len(str(refusal.value).splitlines()) == 1
 
 
@@ -509,7 +510,7 @@ def test_a_factory_that_fails_is_named_in_one_line(
     monkeypatch.setattr(imported.PolicyContext, "of", lambda env: env)
     make = policy_factory(f"own_{name}:{name}", TASK)
     with pytest.raises(PolicyError, match=said.replace("(", r"\(").replace(")", r"\)")) as refusal:
-        make(SimpleNamespace(variant=TASKS[TASK]))
+        make(SimpleNamespace(spec=TASKS[TASK]))
     assert len(str(refusal.value).splitlines()) == 1
 
 
@@ -523,5 +524,7 @@ def test_a_module_that_fails_is_named_in_one_line(
     (tmp_path / f"{name}.py").write_text(body)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.path", [*__import__("sys").path])
+    monkeypatch.setattr(imported.PolicyContext, "of", lambda env: env)
+    make = policy_factory(f"{name}:make", TASK)
     with pytest.raises(PolicyError, match=f"cannot import {name}"):
-        policy_factory(f"{name}:make", TASK)
+        make(SimpleNamespace(spec=TASKS[TASK]))

@@ -24,6 +24,7 @@ TASKS = (
     "sequence-hard",
     "track-line",
     "track-curve",
+    "track-hard",
 )
 
 
@@ -135,6 +136,22 @@ def test_words_that_make_no_sense_are_refused_in_one_line(words, reason, capsys)
     assert reason in refusal(capsys, *words)
 
 
+EVALUATE = "evaluate --task align-fixed --episodes 1 --out {folder}/r.json"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        f"{EVALUATE} --policy {'x' * 5000}",
+        f"{EVALUATE} --policy me --server ws://localhost:99999",
+        "serve --policy zero --host \u202e",
+        f"serve --policy zero --host {'x' * 300}",
+    ],
+)
+def test_what_the_system_cannot_even_look_for_is_refused_in_one_line(words, tmp_path, capsys):
+    refusal(capsys, *words.format(folder=tmp_path).split())
+
+
 @pytest.mark.parametrize(
     "words",
     [
@@ -149,6 +166,47 @@ def test_words_that_make_no_sense_are_refused_in_one_line(words, reason, capsys)
 def test_unknown_task_is_refused_with_the_nearest_name(words, tmp_path, capsys):
     assert "align-thesis" in refusal(capsys, *(w.format(folder=tmp_path) for w in words))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "show align-thesis --out {}/picture.png",
+        "view align-thesis --out {}/film.gif",
+        "bench --task align-thesis",
+        "bench --task align-thesis --expert",
+        "certify align-thesis",
+        "record --task align-thesis --episodes 1 --out {}/data",
+        "evaluate --policy zero --task align-thesis --out {}/r.json",
+        "finetune --policy pretrained --task align-thesis --out {}/p",
+        "train-sac --task align-thesis --out {}/p",
+    ],
+)
+def test_an_option_that_makes_no_sense_is_refused_by_whatever_plays_a_task(words, tmp_path, capsys):
+    words = words.format(tmp_path).split()
+    for option, reason in (
+        ("target_diametre_m=0.03", "did you mean target_diameter_m?"),
+        ("marker=cross", "marker is 'cross', which is not disc, ring or fiducial"),
+        ("marker", "name=value"),
+    ):
+        assert reason in refusal(capsys, *words, "--option", option)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_task_is_shown_filmed_and_measured_with_its_options(tmp_path, capsys):
+    words = ["--option", "time_limit_steps=3", "--option", "marker=ring"]
+    assert run(["show", "align-easy", "--out", str(tmp_path / "s.png"), *words]) == 0
+    # The certificate is of the task as named.
+    assert "certificate" not in capsys.readouterr().out
+    film = ["--policy", "zero", "--out", str(tmp_path / "film.gif")]
+    assert run(["view", "align-easy", *film, *words]) == 0
+    assert "(4 frames)" in capsys.readouterr().out
+    assert run(["bench", "--expert", "--episodes", "2", "--json", *words]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["options"] == {"time_limit_steps": 3, "marker": "ring"}
+    assert figures["successes"] == 0
+    rewards = ["train-sac", "--task", "align-easy", "--out", str(tmp_path / "p")]
+    assert "--reward" in refusal(capsys, *rewards, "--option", "rewards=goal,time")
 
 
 @pytest.mark.parametrize(
@@ -279,7 +337,8 @@ def test_bench_prints_every_figure_as_json(capsys):
     assert run(["bench", "--task", "align-easy", "--seconds", "0.3", "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)
     assert figures["task"] == "align-easy"
-    assert min(value for name, value in figures.items() if name != "task") > 0
+    assert figures["options"] == {}
+    assert min(v for name, v in figures.items() if name not in ("task", "options")) > 0
     assert {
         "steps_per_s",
         "bare_steps_per_s",
@@ -295,7 +354,7 @@ def test_bench_compares_with_a_loop_that_ends_in_the_same_pictures():
     import numpy as np
 
     import hvs_suite
-    from hvs_suite.cli.bench import BareLoop, run_once
+    from hvs_suite.cli.bench_simulation import BareLoop, run_once
 
     with hvs_suite.load("align-thesis") as env:
         episode = run_once(env, 3)
@@ -368,7 +427,7 @@ def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(tmp_path):
 
 def test_a_folder_has_one_writer_until_that_ends_however_it_ends(tmp_path):
     from hvs_suite.errors import OutputError
-    from hvs_suite.policies.run_folder import claimed
+    from hvs_suite.policies.training.run_folder import claimed
 
     holds = (
         "import pathlib, sys; from hvs_suite.files import only_writer\n"

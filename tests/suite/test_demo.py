@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hvs_suite.cli.main import run
-from hvs_suite.eval import result_file
+from hvs_suite.eval.scoring import result_file
 
 EPISODES, EVALUATIONS = 3, 2
 

@@ -1,6 +1,9 @@
-"""A family of tasks in a package of somebody else's, from its installation to a checked dataset."""
+"""A family of tasks in a package of somebody else's, from its installation to a board."""
 
+import json
 import os
+import re
+import shlex
 import subprocess
 import sys
 import zipfile
@@ -10,6 +13,7 @@ import pytest
 
 PACKAGE = Path(__file__).parent / "third_party"
 MODULE = PACKAGE / "hvs_shelf.py"
+PAGE = (Path(__file__).parents[2] / "docs" / "own-task.md").read_text("utf-8")
 HVS = "from hvs_suite.cli.main import main; main()"
 pytestmark = pytest.mark.timeout(300)
 
@@ -23,6 +27,22 @@ other = gymnasium.make("hvs_suite/shelf-high-v1", split="test")
 observation, info = other.reset(options={"scenario": 4})
 assert (observation["eth"] == seen["eth"]).all()
 print(info["task"], *info["errors"])
+"""
+_NAMES = """
+import sys
+from pathlib import Path
+from hvs_suite.errors import ResultError
+from hvs_suite.eval.board import ours
+from hvs_suite.eval.scoring import result_file
+expert, mine = (Path(sys.argv[1], name, "shelf-easy.json") for name in ("expert", "mine"))
+ours.check(expert, result_file.load(expert))
+ours.check(mine, result_file.load(mine))
+for path, file in ((expert, mine), (mine, expert)):
+    try:
+        ours.check(path, result_file.load(file))
+    except ResultError:
+        continue
+    raise AssertionError(f"{file} passes as {path}")
 """
 
 
@@ -81,28 +101,70 @@ def test_its_tasks_are_listed_loaded_and_made_like_our_own(installed: Path, tmp_
     assert done.stdout.split()[:2] == ["shelf-high", "position_error_mm"]
 
 
-def test_its_demonstrations_are_recorded_and_checked(installed: Path, tmp_path: Path) -> None:
-    words = ["--task", "shelf-easy", "--episodes", "3", "--workers", "2", "--out", "data"]
-    done = hvs("record", *words, path=installed, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "3 episodes, 3 of them solved" in done.stdout
-    checked = hvs("check", "data", path=installed, cwd=tmp_path)
-    assert "3 episodes" in checked.stdout
-    assert (checked.stdout.count("no damage"), checked.returncode) == (1, 0), checked.stdout
+def test_the_page_shows_this_very_package() -> None:
+    blocks = dict(re.findall(r"```(python|toml)\n(.*?)```", PAGE, re.DOTALL))
+    assert blocks["python"] == MODULE.read_text("utf-8")
+    assert blocks["toml"] == (PACKAGE / "pyproject.toml").read_text("utf-8")
+
+
+@pytest.mark.timeout(900)
+def test_it_goes_from_demonstrations_to_a_board_by_the_commands_of_the_page(
+    installed: Path, tmp_path: Path
+) -> None:
+    """In miniature: few episodes and steps, and a board that says it is a draft."""
+    block = re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL)[-1]
+    for long, short in (
+        ("--episodes 1000", "--episodes 3"),
+        ("--minutes 10 --dagger-rounds 4", "--steps 2 --dagger-rounds 1 --dagger-frames 20"),
+        ("hvs leaderboard", "hvs leaderboard --draft"),
+    ):
+        assert long in block
+        block = block.replace(long, short)
+    said = {}
+    for line in block.splitlines():
+        program, *words = shlex.split(line)
+        assert program == "hvs"
+        done = hvs(*words, path=installed, cwd=tmp_path)
+        assert done.returncode == 0, (line, done.stdout, done.stderr)
+        said[words[0], words[words.index("--policy") + 1] if "--policy" in words else ""] = done
+    assert "3 episodes" in said["record", ""].stdout
+    assert said["check", ""].stdout.count("no damage") == 1
+    assert "DAgger round 1: 20 frames" in said["pretrain", ""].stdout
+    assert "3 of 3 (100.0 %)" in said["evaluate", "expert"].stdout
+    assert said["verify", ""].stdout.count("as it says; 3 of 3") == 2
+    board = (tmp_path / "runs" / "board" / "LEADERBOARD.md").read_text("utf-8")
+    assert "## shelf-easy-v1" in board
+    assert "| expert | 100" in board
+    assert "| mine | " in board
+    # The policy remembers what it is for.
+    config = json.loads((tmp_path / "runs" / "policy" / "config.json").read_text("utf-8"))
+    assert config["family"] == "shelf"
+    # On a board of one's own our names may stand, but for our own policies alone.
+    named = run("-c", _NAMES, "runs/results", path=installed, cwd=tmp_path)
+    assert named.returncode == 0, named.stderr
     # Who has not installed the package is told which task is missing.
-    alone = hvs("check", "data", path=tmp_path, cwd=tmp_path)
-    assert alone.returncode != 0
-    assert "shelf-easy" in alone.stdout + alone.stderr
-    assert "Traceback" not in alone.stderr
+    for words in ("check runs/shelf", "verify runs/results"):
+        alone = hvs(*words.split(), path=tmp_path, cwd=tmp_path)
+        assert alone.returncode != 0
+        assert "shelf-easy" in alone.stdout + alone.stderr
+        assert "Traceback" not in alone.stderr
 
 
-def test_a_module_can_be_tried_without_installing_it(tmp_path: Path) -> None:
+def test_a_module_goes_to_a_board_without_being_installed(tmp_path: Path) -> None:
     """Workers import it too."""
     (tmp_path / MODULE.name).write_bytes(MODULE.read_bytes())
-    words = ["--task", "shelf-easy", "--episodes", "2", "--workers", "2", "--out", "data"]
-    done = hvs("--plugin", "hvs_shelf", "record", *words, path=tmp_path, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "2 episodes, 2 of them solved" in done.stdout
+    for line in (
+        "record --task shelf-easy --episodes 2 --noise 0.02 --workers 2 --out data",
+        "evaluate --policy zero --task shelf-easy --episodes 2 --workers 2 "
+        "--out results/zero/shelf-easy.json",
+        "verify results --workers 2",
+        "leaderboard --draft --results results --out board",
+        "show shelf-easy --option height_m=0.02,0.05 --out shelf.png",
+    ):
+        done = hvs("--plugin", "hvs_shelf", *line.split(), path=tmp_path, cwd=tmp_path)
+        assert done.returncode == 0, (line, done.stdout, done.stderr)
+    assert "## shelf-easy-v1" in (tmp_path / "board" / "LEADERBOARD.md").read_text("utf-8")
+    assert (tmp_path / "shelf.png").stat().st_size > 0
 
 
 @pytest.mark.parametrize(

@@ -222,6 +222,16 @@ def test_certifying_writes_the_named_task_and_leaves_the_others(
     assert (made.scenarios, made.digest, made.holds) == (4, own_lock.digest, True)
 
 
+@pytest.mark.usefixtures("own_lock")
+def test_of_a_changed_task_the_certificate_is_printed_and_nothing_is_written(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    before = written()
+    assert run(["certify", "align-easy", "--option", "standoff_m=0.06"]) == 0
+    assert "4 test scenarios, with standoff_m=0.06" in capsys.readouterr().out
+    assert written() == before
+
+
 def test_a_task_that_fails_a_check_is_not_locked(
     own_lock: lock.LockEntry, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -31,7 +31,7 @@ ANYWHERE = {"position_tolerance_mm": 5000.0, "tilt_tolerance_deg": 180.0}
 
 @pytest.mark.parametrize(
     ("task", "options"),
-    [("track-line", {}), ("sequence-thesis", {"target_steps": 2})],
+    [("track-line", {}), ("track-hard", {}), ("sequence-thesis", {"target_steps": 2})],
 )
 def test_a_picture_drawn_afterwards_is_the_one_observed_then(
     task: str, options: dict[str, Any]
@@ -137,7 +137,7 @@ def near(position: FloatArray, posture: FloatArray | None) -> FloatArray:
     return np.asarray(found[np.abs(found - (0.0 if posture is None else posture)).sum(1).argmin()])
 
 
-@pytest.mark.parametrize("task", ["track-line", "track-curve"])
+@pytest.mark.parametrize("task", ["track-line", "track-curve", "track-hard"])
 def test_a_moving_goal_is_where_it_was_said_to_be(task: str) -> None:
     """``goal(ahead_s)`` foretells it, its speed is its derivative, and playing again repeats it."""
     with hvs_suite.load(task, split="test", observations="state") as env:

@@ -1,5 +1,6 @@
 """What a named task may be loaded with, and the one clear line for what makes no sense."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -9,6 +10,7 @@ from postures import posture_at
 
 import hvs_suite
 from hvs_suite.errors import HvsError, OptionError, UnknownTaskError
+from hvs_suite.tasks.shared.option_types import to_text
 from hvs_suite.tasks.shared.spec import JOINT_LIMITS_DEG
 
 
@@ -115,6 +117,73 @@ def test_lists_do_for_tuples_as_they_come_from_json() -> None:
         assert env.spec.rewards == ("goal", "time")
 
 
+@pytest.mark.parametrize(
+    ("words", "options"),
+    [
+        (["target_diameter_m=0.03"], {"target_diameter_m": 0.03}),
+        (["ring_m=0.45,0.7"], {"ring_m": (0.45, 0.7)}),
+        (["ring_m = (0.45, 0.7)"], {"ring_m": (0.45, 0.7)}),
+        (["vary_light=true", "vary_colour=True"], {"vary_light": True, "vary_colour": True}),
+        (["marker=ring", "latency_steps=1"], {"marker": "ring", "latency_steps": 1}),
+        (["start=near_goal", "goal=0.5,-0.3"], {"start": "near_goal", "goal": (0.5, -0.3)}),
+        (["start=0,0.5,0,-1,0,1,0"], {"start": (0, 0.5, 0, -1, 0, 1, 0)}),
+        (["rewards=goal", "standoff_m=1e-1"], {"rewards": ("goal",), "standoff_m": 0.1}),
+        (["observations=eih+joint_positions"], {"observations": "eih+joint_positions"}),
+        (
+            ["position_tolerance_mm=none", "lateral_tolerance_mm=0.2", "height_tolerance_mm=1"],
+            {
+                "position_tolerance_mm": None,
+                "lateral_tolerance_mm": 0.2,
+                "height_tolerance_mm": 1,
+            },
+        ),
+        # What the task has already changes nothing.
+        (["hold_steps=1", "marker=disc", "vary_light=false", "standoff_m=0.05"], {}),
+    ],
+)
+def test_options_are_read_from_text_by_their_own_types(
+    words: list[str], options: dict[str, Any]
+) -> None:
+    assert hvs_suite.TASKS["align-thesis"].options_from_text(words) == options
+
+
+@pytest.mark.each_task
+def test_every_parameter_of_a_task_can_be_given_as_text(task: str) -> None:
+    spec = hvs_suite.TASKS[task]
+    parameters = dataclasses.asdict(spec)
+    del parameters["name"], parameters["version"]
+    words = [f"{name}={to_text(value)}" for name, value in parameters.items()]
+    assert spec.options_from_text(words) == {}
+    # A spec of other values takes the same words for changes.
+    other = dataclasses.replace(spec, time_limit_steps=spec.time_limit_steps + 1)
+    assert other.options_from_text(words) == {"time_limit_steps": spec.time_limit_steps}
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["colour=red"], "no option 'colour'; did you mean vary_colour"),
+        (["xyzzy=1"], "no option 'xyzzy'; use .*target_diameter_m.*"),
+        (["marker"], "given as name=value"),
+        (["=1"], "no option ''"),
+        (["name=align-hard"], "no option 'name'"),
+        (["marker=cross"], "marker is 'cross', which is not disc, ring or fiducial"),
+        (["time_limit_steps=2.5"], "time_limit_steps is 2.5, which is not int"),
+        (["target_diameter_m=wide"], "target_diameter_m is 'wide', which is not float"),
+        (["target_diameter_m=nan"], "target_diameter_m is nan"),
+        (["vary_light=1"], "vary_light is 1, which is not bool"),
+        (["ring_m=0.5"], r"ring_m is 0.5, which is not \(float, float\)"),
+        (["ring_m=0.5,0.6,0.7"], "ring_m is"),
+        (["ring_m=0.7,0.4"], "inner and a larger outer radius"),
+        (["marker=ring", "marker=disc"], "marker is given twice"),
+    ],
+)
+def test_text_that_is_no_option_is_refused_in_one_line(words: list[str], reason: str) -> None:
+    with pytest.raises(OptionError, match=reason) as raised:
+        hvs_suite.TASKS["align-thesis"].options_from_text(words)
+    assert len(str(raised.value).splitlines()) == 1
+
+
 def test_joint_limits_of_the_options_are_those_of_the_robot() -> None:
     from hvs_suite.cell.robot import JOINT_RANGE_RAD
 
@@ -188,7 +257,7 @@ def test_named_tasks_mean_what_the_table_of_tasks_says() -> None:
     tasks = hvs_suite.TASKS
     assert list(tasks) == [
         "align-fixed", "align-easy", "align-thesis", "align-hard", "align-drill", "align-limit",
-        "sequence-thesis", "sequence-hard", "track-line", "track-curve",
+        "sequence-thesis", "sequence-hard", "track-line", "track-curve", "track-hard",
     ]  # fmt: skip
     own = {"align": "goal", "sequence": "target_steps", "track": "motion"}
     rows = {
@@ -207,9 +276,10 @@ def test_named_tasks_mean_what_the_table_of_tasks_says() -> None:
         "align-drill": ("random", "random", 0.01, None, 0.25, 1.0, 0.4, 5, 40),
         "align-limit": ("random", "random", 0.02, None, 0.1, 0.3, 0.2, 5, 40),
         "sequence-thesis": ("zero", 30, 0.05, 1.0, None, None, 1.0, 1, 150),
-        "sequence-hard": ("random", 40, 0.02, 0.5, None, None, 0.5, 3, 200),
+        "sequence-hard": ("random", 31, 0.02, None, 0.25, 1.0, 0.4, 5, 155),
         "track-line": ("zero", "line", 0.05, 1.0, None, None, 1.0, 20, 60),
         "track-curve": ("zero", "curve", 0.05, 1.0, None, None, 1.0, 20, 60),
+        "track-hard": ("random", "curve", 0.02, 1.0, None, None, 0.5, 20, 80),
     }
     for v in tasks.values():
         assert v.standoff_m == 0.05

@@ -219,7 +219,9 @@ def test_fixed_places_are_ten_and_taken_by_index() -> None:
 
 
 @pytest.mark.parametrize("n", [100, pytest.param(1000, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("task", ["align-hard", "align-drill", "align-limit", "sequence-hard"])
+@pytest.mark.parametrize(
+    "task", ["align-hard", "align-drill", "align-limit", "sequence-hard", "track-hard"]
+)
 def test_random_starts_are_clear_and_far_from_the_goal_with_time_to_spare(
     named: Named, task: str, n: int
 ) -> None:
@@ -268,13 +270,13 @@ def test_undisturbed_tasks_are_undisturbed(task: str) -> None:
     np.testing.assert_array_equal(scenario.light_level, 1.0)
 
 
-@pytest.mark.parametrize("task", ["align-hard", "align-drill", "sequence-hard"])
+@pytest.mark.parametrize("task", ["align-hard", "align-drill", "sequence-hard", "track-hard"])
 def test_disturbed_tasks_draw_every_disturbance_anew(task: str) -> None:
     draws = source(task)
     scenes = [draws.draw(index) for index in range(8)]
     drawn = ["eth_shift", "eth_turn", "light_direction", "light_level", "surface_rgb"]
     drawn += ["target_rgb", "robot_tint", "texture_seed"]
-    drawn += ["joint_offset"] if task == "align-drill" else []
+    drawn += ["joint_offset"] if task in ("align-drill", "sequence-hard") else []
     for name in drawn:
         values = {np.asarray(getattr(scene, name)).tobytes() for scene in scenes}
         assert len(values) == len(scenes), name

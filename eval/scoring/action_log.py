@@ -1,0 +1,119 @@
+"""The action log beside a result: every action of every scenario, from which all else follows.
+
+``<file stem>.actions.npz`` holds ``steps`` (n,) int64, the control steps played in scenarios
+0..n-1, and ``actions`` (sum of steps, 7) float32, scenario after scenario, as the policy gave them,
+before clipping. Equal actions give equal bytes.
+"""
+
+import hashlib
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from hvs_suite import reading
+from hvs_suite.errors import ResultError
+
+Actions = npt.NDArray[np.float32]
+
+MOST_BYTES = 64 * 2**20
+"""Largest log that is read, packed or not: sixty times that of 1,000 scenarios of 40 steps."""
+MOST_SCENARIOS = 100_000
+_ACTION_SIZE = 7
+_SAME = 1e-4
+"""Actions this close are the same: a thousand roundings apart, and a hundredth of a millimetre."""
+_SAME_STEPS = 0.7
+
+
+def encode(actions: Sequence[Actions]) -> bytes:
+    """Returns the file for (steps, 7) actions of each scenario from 0 up."""
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        steps=np.array([len(episode) for episode in actions], np.int64),
+        actions=np.concatenate(actions).astype(np.float32),
+    )
+    return buffer.getvalue()
+
+
+def digest(path: Path) -> str:
+    """Returns the SHA-256 of a file, as ``sha256sum`` prints it.
+
+    Raises:
+        ResultError: The file cannot be read, or is larger than any log.
+    """
+    return hashlib.sha256(_content(path)).hexdigest()
+
+
+def load(path: Path, sha256: str) -> list[Actions]:
+    """Reads a log.
+
+    Args:
+        path: The file.
+        sha256: What its result says of it.
+
+    Returns:
+        (steps, 7) float32 of each scenario from 0 up.
+
+    Raises:
+        ResultError: It is missing, is not the one that the result was made with, or is no log.
+    """
+    if digest(path) != sha256:
+        raise ResultError(f"{path}: is not the action log that its result was written with")
+    log = reading.read_npz(
+        path,
+        {"steps": (np.int64, 1), "actions": (np.float32, 2)},
+        most=MOST_BYTES,
+        error=ResultError,
+    )
+    steps, actions = log["steps"], log["actions"]
+    if (
+        not 0 < len(steps) <= MOST_SCENARIOS
+        # One by one first: a sum of huge numbers may come round to any other.
+        or not ((steps >= 0) & (steps <= len(actions))).all()
+        or steps.sum() != len(actions)
+        or actions.shape[1] != _ACTION_SIZE
+        or not np.isfinite(actions).all()
+    ):
+        raise ResultError(f"{path}: is no action log; steps and actions do not fit together")
+    return np.split(actions, np.cumsum(steps)[:-1])
+
+
+def executed(actions: Sequence[Actions], steps: int) -> Actions:
+    """Returns the actions as they were carried out, clipped: (n, steps, 7), NaN after the end.
+
+    Args:
+        actions: (steps, 7) of each of n scenarios.
+        steps: At least as many as any of them holds.
+    """
+    padded = np.full((len(actions), steps, _ACTION_SIZE), np.nan, np.float32)
+    for scenario, episode in enumerate(actions):
+        padded[scenario, : len(episode)] = np.clip(episode, -1.0, 1.0)
+    return padded
+
+
+def share_alike(one: Actions, other: Actions) -> float:
+    """Returns in which share of the scenarios two policies did the same, in [0, 1].
+
+    The same are seven in ten of the steps that both played, each action to a ten-thousandth of its
+    range. Whoever copies changes some; where both go at full speed, any two good policies agree.
+
+    Args:
+        one: As `executed` gives them, up to where each scenario was scored: what comes after it
+            gives no score, and could be anything in a copy.
+        other: Likewise, of the same task.
+    """
+    n = min(len(one), len(other))
+    apart = np.abs(one[:n] - other[:n]).max(axis=-1)
+    played = (~np.isnan(apart)).sum(axis=-1)
+    alike = (apart <= _SAME).sum(axis=-1)
+    return float(((played > 0) & (alike >= _SAME_STEPS * played)).mean())
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return reading.read_bytes(path, most=MOST_BYTES, error=ResultError)
+    except ResultError as error:
+        raise ResultError(f"{error}; the action log belongs beside its result") from error

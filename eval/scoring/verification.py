@@ -1,0 +1,358 @@
+"""Plays a result's logged actions again, without pictures, and recomputes every number.
+
+What the actions did is thereby proven; that a certain policy chose them is not, and versions of
+packages are believed. A policy's failures (NaN, too slow) are believed too: they only ever cost it
+an episode.
+"""
+
+import contextlib
+import dataclasses
+import hashlib
+import math
+import os
+import secrets
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from hvs_suite import registry, rollout
+from hvs_suite.errors import OptionError, ResultError
+from hvs_suite.eval.scoring import action_log, contender, result_file
+from hvs_suite.eval.scoring.result_file import EpisodeRow, Result
+from hvs_suite.eval.scoring.trial import (
+    EpisodeLostError,
+    MakeTask,
+    Stage,
+    outcome,
+    play_trial,
+    same_outcome,
+)
+from hvs_suite.names import shown
+from hvs_suite.policies import builtin, catalogue
+from hvs_suite.rollout import Action, Observation
+from hvs_suite.tasks.shared import lock
+from hvs_suite.tasks.shared.option_types import listed
+
+NEAR: Mapping[str, float] = {"mm": 1e-3, "deg": 1e-5}
+"""Re-simulated metrics may differ by this much, by unit: another processor rounds differently."""
+NEAR_OTHERWISE = 1e-3
+LOG_ENDS = "the action log ends"
+MOST_NEAR_PER_MILLE = 5
+"""Outcomes of a thousand that rounding may decide, at least one: far more than chance brings, and
+too few to lift a score."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Verdict:
+    """What verifying a result found, if it found nothing wrong.
+
+    Attributes:
+        n_episodes: Scenarios of the result.
+        n_played: Those that were played again.
+        n_near: Those of them whose outcome rounding decided, at a bound on an error.
+        nonce: What a sample was drawn with; None where all were played.
+        largest: Largest difference of a metric, by unit.
+    """
+
+    n_episodes: int
+    n_played: int
+    n_near: int
+    nonce: str | None
+    largest: Mapping[str, float]
+
+
+class ReplayStage(Stage, Protocol):
+    """What a replay needs of an environment beyond a trial."""
+
+    slack: Mapping[str, float]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ReplayTrial:
+    """Plays a scenario's logged actions, for `rollout.play`.
+
+    Attributes:
+        actions: (steps, 7) of each scenario that is logged; in others the policy itself plays.
+        claimed: What the result says of each; why its policy had no further action is believed.
+    """
+
+    actions: Mapping[int, Action]
+    claimed: Mapping[int, EpisodeRow]
+
+    def __call__(
+        self, env: ReplayStage, policy: rollout.Policy, scenario: int
+    ) -> tuple[EpisodeRow, bool]:
+        """Returns the row that the actions give, and whether rounding decided its outcome.
+
+        Where the claimed outcome is another, the scenario is played with bounds that are a rounding
+        wider, and a rounding narrower: if that gives the claimed outcome, exactly, rounding is
+        taken to have decided it.
+        """
+        claimed = self.claimed[scenario]
+        found, log = self._play(env, policy, scenario, self.actions.get(scenario))
+        if same_outcome(found, claimed):
+            return found, False
+        try:
+            for sign in (1.0, -1.0):
+                env.slack = {unit: sign * near for unit, near in NEAR.items()}
+                other, _ = self._play(env, policy, scenario, log)
+                if same_outcome(other, claimed):
+                    return other, True
+        finally:
+            env.slack = {}
+        return found, False
+
+    def _play(
+        self, env: ReplayStage, policy: rollout.Policy, scenario: int, log: Action | None
+    ) -> tuple[EpisodeRow, Action]:
+        if log is None:
+            return play_trial(env, policy.reset, policy.select_action, scenario)
+        remaining = iter(log)
+
+        def decide(observation: Observation) -> Action:
+            action = next(remaining, None)
+            if action is None:
+                raise EpisodeLostError(self.claimed[scenario].settled.failure or LOG_ENDS)
+            return action
+
+        return play_trial(env, lambda: None, decide, scenario)
+
+
+def verify(
+    path: Path,
+    *,
+    sample: int | None = None,
+    nonce: str | None = None,
+    workers: int = 1,
+    progress: Callable[[], None] | None = None,
+) -> Verdict:
+    """Checks a result file against its action log and the task.
+
+    Args:
+        path: The result; its action log stands beside it.
+        sample: Scenarios to play again; None plays all.
+        nonce: What the sample is drawn with, to repeat a draw; a new one by default, since whoever
+            made the file must not know it.
+        workers: Processes that share the work.
+        progress: Called after each scenario.
+
+    Returns:
+        What was checked.
+
+    Raises:
+        ResultError: Something is not as the file says; names it.
+        UnknownTaskError: The result's task does not exist.
+        OptionError: `sample` or `workers` is below 1.
+    """
+    if sample is not None and sample < 1:
+        raise OptionError(f"a sample holds at least 1 scenario, not {sample}")
+    result = result_file.load(path)
+    check_task(path, result)
+    log, rows = load_actions(path, result), result.episodes
+    if sample is None or sample >= len(rows):
+        chosen, nonce = list(range(len(rows))), None
+    else:
+        nonce = new_nonce() if nonce is None else nonce
+        chosen = drawn(len(rows), sample, nonce)
+    n_near, largest = 0, {"mm": 0.0, "deg": 0.0}
+    for scenarios, make, pictures in _in_parts(path, result, chosen, len(log)):
+        replay = ReplayTrial(
+            {index: log[index] for index in scenarios if index < len(log)},
+            {index: rows[index] for index in scenarios},
+        )
+        task = MakeTask(
+            result.summary.task, result.summary.split, result.metadata.options, pictures=pictures
+        )
+        with contextlib.closing(
+            rollout.play(task, make, scenarios, replay, workers=workers)
+        ) as played:
+            for row, by_rounding in played:
+                _compare(path, rows[row.scenario], row, largest)
+                n_near += by_rounding
+                if progress is not None:
+                    progress()
+    most = max(1, MOST_NEAR_PER_MILLE * len(chosen) // 1000)
+    if n_near > most:
+        raise ResultError(
+            f"{path}: rounding would have decided {n_near} of {len(chosen)} outcomes as the file "
+            f"says; more than {most} is no chance"
+        )
+    return Verdict(len(rows), len(chosen), n_near, nonce, largest)
+
+
+def _in_parts(
+    path: Path, result: Result, chosen: Sequence[int], n_logged: int
+) -> Iterator[tuple[list[int], rollout.PolicyFactory, bool]]:
+    """What is logged is replayed without pictures; a built-in policy plays the rest itself."""
+    logged = [index for index in chosen if index < n_logged]
+    if logged:
+        yield logged, builtin.make_zero, False
+    rest = [index for index in chosen if index >= n_logged]
+    if rest:
+        yield rest, builtin_policy(path, result), True
+
+
+def builtin_policy(path: Path, result: Result) -> rollout.PolicyFactory:
+    """Returns the built-in policy that a result names.
+
+    Args:
+        path: The result's file.
+        result: What it holds.
+
+    Raises:
+        ResultError: There is none of this name. Any other name is not looked for: a stranger's file
+            must not choose code to run or weights to load.
+    """
+    policy = result.summary.policy
+    if policy not in catalogue.BUILTIN:
+        raise ResultError(
+            f"{path}: {shown(policy)!r} is no built-in policy, but the action log does not hold "
+            "all scenarios; evaluate again"
+        )
+    return contender.find(policy, result.summary.task).make
+
+
+def check_task(path: Path, result: Result) -> None:
+    """Checks that a result was made on the task as its name, and its options, mean it here.
+
+    Raises:
+        ResultError: It was not.
+        UnknownTaskError: There is no such task.
+    """
+    ours, metadata = result.summary.task, result.metadata
+    named = registry.find(ours)
+    try:
+        spec = named.with_options(metadata.options)
+    except OptionError as error:
+        raise ResultError(f"{path}: metadata.options: {error}") from error
+    if registry.options_of(spec) != metadata.options:
+        raise ResultError(f"{path}: metadata.options are not what differs from {ours}")
+    for name, said, known in (
+        ("task_version", metadata.task_version, spec.version),
+        ("task_digest", metadata.task_digest, lock.digest(ours)),
+        ("tolerances", metadata.tolerances, spec.tolerances),
+        ("time_limit_steps", metadata.time_limit_steps, spec.time_limit_steps),
+        ("metrics", sorted(result.episodes[0].errors), sorted(m.name for m in spec.metrics)),
+    ):
+        if said != known:
+            raise ResultError(
+                f"{path}: {name} is {said}, but {known} for {ours} in this hvs_suite; evaluate "
+                "again, or check with the version that made it"
+            )
+
+
+def check_as_named(path: Path, result: Result) -> None:
+    """Checks that a result is one of the named task, and not of what options made of it.
+
+    Raises:
+        ResultError: It is not.
+    """
+    if result.metadata.options:
+        raise ResultError(
+            f"{path}: the task was changed ({shown(listed(result.metadata.options))}); only the "
+            "task as named is scored"
+        )
+
+
+def load_actions(path: Path, result: Result) -> list[action_log.Actions]:
+    """Reads the action log of a result.
+
+    Args:
+        path: The result's file.
+        result: What it holds.
+
+    Returns:
+        (steps, 7) float32 of each of its first `Metadata.n_logged` rows.
+
+    Raises:
+        ResultError: The log cannot be read, is another one, or is not as long as the rows say.
+    """
+    log = action_log.load(result_file.actions_path(path), result.metadata.actions_sha256)
+    rows = result.episodes
+    n_logged = result.metadata.n_logged
+    if len(log) != n_logged:
+        raise ResultError(
+            f"{path}: the action log holds {len(log)} scenarios, the result says {n_logged}"
+        )
+    for row, actions in zip(rows[:n_logged], log, strict=True):
+        if len(actions) != row.settled.steps:
+            raise ResultError(
+                f"{path}: scenario {row.scenario}: settled.steps is {row.settled.steps}, but "
+                f"{len(actions)} actions are logged"
+            )
+        if len(actions) > result.metadata.time_limit_steps:
+            raise ResultError(
+                f"{path}: scenario {row.scenario}: {len(actions)} actions are logged, more than "
+                f"the time limit of {result.metadata.time_limit_steps} steps"
+            )
+    return log
+
+
+def new_nonce() -> str:
+    """Returns what a sample can be drawn with and nobody could know before: 32 hex digits."""
+    return secrets.token_hex(16)
+
+
+def drawn(n: int, sample: int, nonce: str) -> list[int]:
+    """Returns which of the scenarios 0..n-1 a nonce draws, `sample` of them in order."""
+    key = int.from_bytes(hashlib.sha256(nonce.encode()).digest()[:16], "little")
+    random = np.random.Generator(np.random.Philox(key=key))
+    return sorted(random.choice(n, size=sample, replace=False).tolist())
+
+
+def _compare(path: Path, said: EpisodeRow, found: EpisodeRow, largest: dict[str, float]) -> None:
+    """Compares a row with the one played again; keeps the largest differences of errors.
+
+    Raises:
+        ResultError: They differ.
+    """
+    where = f"{path}: scenario {said.scenario}"
+    theirs = outcome(found)
+    for name, value in outcome(said).items():
+        if value != theirs[name]:
+            raise ResultError(
+                f"{where}: {name} is {value}, but the logged actions give {theirs[name]}"
+            )
+    played = _figures(found)
+    for name, figure in _figures(said).items():
+        unit = name.rpartition("_")[2]
+        if name not in played:
+            raise ResultError(f"{where}: {name} is no metric of the task")
+        largest[unit] = max(largest.get(unit, 0.0), abs(figure - played[name]))
+        # Both are rounded to a millionth, which may part them by one more.
+        bound = NEAR.get(unit, NEAR_OTHERWISE) + 2e-6
+        if not math.isclose(figure, played[name], rel_tol=0.0, abs_tol=bound):
+            raise ResultError(
+                f"{where}: {name} is {figure}, but the logged actions give {played[name]}"
+            )
+
+
+def _figures(row: EpisodeRow) -> dict[str, float]:
+    """Every metric of a row, and where it landed, by name."""
+    end = row.settled
+    settled = {f"settled.{name}": value for name, value in end.errors.items()}
+    return row.errors | settled | {"settled.x_mm": end.x_mm, "settled.y_mm": end.y_mm}
+
+
+def results_in(paths: Sequence[Path]) -> list[Path]:
+    """Returns the result files that are named or lie below the folders that are.
+
+    Raises:
+        OptionError: There is none, or a path does not exist.
+    """
+    found: list[Path] = []
+    for path in paths:
+        if not path.exists():
+            raise OptionError(f"{path} does not exist; name a result file or a folder of them")
+        below = [Path(folder, name) for folder, _, names in os.walk(path) for name in names]
+        found += sorted(f for f in below if f.suffix == ".json") if path.is_dir() else [path]
+    if not found:
+        raise OptionError("there are no results there; name a result file or a folder of them")
+    return found
+
+
+def as_json(path: Path, verdict: Verdict) -> dict[str, Any]:
+    """Returns a verdict as plain data, for ``--json``."""
+    return {"file": str(path), **dataclasses.asdict(verdict)}

@@ -1,0 +1,367 @@
+"""Plays a checkpoint folder, ours or any other LeRobot policy's, in an environment.
+
+A checkpoint of type `hvs` whose processors are the standard identity ones is played by its network
+alone: LeRobot's policies take ten seconds and a gigabyte to import, in every worker. Tests hold
+that both ways give the same action. Anything else goes through LeRobot.
+"""
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import pydantic
+import torch
+from torch import Tensor
+
+from hvs_suite.errors import PolicyError, first_line
+from hvs_suite.policies.checkpoints.files import (
+    MOST_SIZE,
+    POSTPROCESSOR,
+    PREPROCESSOR,
+    WEIGHTS,
+    Size,
+    check_sizes,
+    check_weights,
+    read_config,
+    read_settings,
+    read_steps,
+)
+from hvs_suite.policies.hvs.compiled import CompiledNetwork
+from hvs_suite.policies.hvs.network import (
+    IMAGE_PREFIX,
+    N_JOINTS,
+    RESIDUAL_BOUND,
+    STATE,
+    HvsNetwork,
+    shape_from_config,
+)
+from hvs_suite.policies.trained_for import check_trained_for
+from hvs_suite.rollout import Observation, one_torch_thread
+from hvs_suite.tasks.shared.spec import Spec
+
+Action = npt.NDArray[np.float32]
+Batch = dict[str, Any]
+"""Tensors under LeRobot's names, and the task as a sentence."""
+Decide = Callable[[Batch], Tensor]
+
+VECTOR_PREFIX = "observation."
+TASK = "task"
+
+# Where the network's own keys live in a checkpoint of the LeRobot policy around it.
+NETWORK_PREFIX = "network."
+STANDARD_STEPS = {
+    PREPROCESSOR: (
+        "rename_observations_processor",
+        "to_batch_processor",
+        "device_processor",
+        "normalizer_processor",
+    ),
+    POSTPROCESSOR: ("unnormalizer_processor", "device_processor"),
+}
+
+
+class Stage(Protocol):
+    """What a checkpoint needs of an environment."""
+
+    @property
+    def spec(self) -> Spec:
+        """Parameters of the task."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CheckpointFactory:
+    """Makes policies from a checkpoint folder; travels to workers as its path.
+
+    Attributes:
+        folder: The checkpoint.
+    """
+
+    folder: str
+
+    def __call__(self, env: Stage) -> "CheckpointPolicy":
+        """Load the checkpoint for an environment.
+
+        Raises:
+            PolicyError: It cannot be loaded, or does not fit the environment.
+        """
+        return CheckpointPolicy(Path(self.folder), env.spec)
+
+
+class CheckpointPolicy:
+    """A LeRobot policy behind the suite's policy interface.
+
+    Args:
+        folder: The checkpoint.
+        spec: Task to be played.
+
+    Raises:
+        PolicyError: The checkpoint cannot be loaded, or does not fit the task.
+    """
+
+    def __init__(self, folder: Path, spec: Spec) -> None:
+        config = read_config(folder)
+        check_fit(config, folder, spec)
+        self._inputs = tuple(config["input_features"])
+        with one_torch_thread():
+            if config.get("type") == "hvs" and _processors_are_standard(folder):
+                self._decide, self._forget = _network(folder, config)
+            else:
+                self._decide, self._forget = _lerobot(folder)
+        self._sentence = spec.instruction()
+
+    def instruct(self, sentence: str) -> None:
+        """Take in the task of the coming episode as a sentence."""
+        self._sentence = sentence
+
+    def reset(self) -> None:
+        """Forget the last episode."""
+        self._forget()
+
+    def select_action(self, observation: Observation) -> Action:
+        """Decide on an unbatched observation of the environment.
+
+        Args:
+            observation: ``eih`` and ``eth`` (H, W, C) uint8, ``joint_positions`` (7,) rad and
+                ``joint_velocities`` (7,) rad/s, as far as the policy reads them.
+
+        Returns:
+            (7,) float32.
+        """
+        with one_torch_thread(), torch.inference_mode():
+            action = self._decide({**as_batch(observation, self._inputs), TASK: self._sentence})
+        return np.array(action.reshape(-1).cpu().numpy(), np.float32)
+
+
+def as_batch(observation: Observation, keys: Iterable[str]) -> dict[str, Tensor]:
+    """An observation of the environment under LeRobot's names and in its ranges.
+
+    Args:
+        observation: As in `CheckpointPolicy.select_action`.
+        keys: What is read of it: ``observation.images.<camera>``, ``observation.state`` and
+            ``observation.<name>``, what else a family shows.
+
+    Returns:
+        Images (C, H, W) in [0, 1] and the state (14,) or (7,), float32, no batch dimension.
+    """
+    batch: dict[str, Tensor] = {}
+    for key in keys:
+        if key.startswith(IMAGE_PREFIX):
+            image = torch.from_numpy(observation[key.removeprefix(IMAGE_PREFIX)])
+            batch[key] = image.permute(2, 0, 1).to(torch.float32) / 255.0
+        elif key == STATE:
+            parts = ["joint_positions", "joint_velocities"]
+            joints = [observation[name] for name in parts if name in observation]
+            batch[key] = torch.from_numpy(np.concatenate(joints).astype(np.float32))
+        else:
+            vector = observation[key.removeprefix(VECTOR_PREFIX)]
+            batch[key] = torch.from_numpy(vector.astype(np.float32))
+    return batch
+
+
+def network_inputs(
+    network: HvsNetwork, observation: Observation
+) -> tuple[dict[str, Tensor], Tensor | None]:
+    """An observation as `HvsNetwork.forward` takes it, a batch of one.
+
+    Args:
+        network: Its shape says what it reads.
+        observation: As in `CheckpointPolicy.select_action`.
+
+    Returns:
+        Images by camera, and the state.
+    """
+    shape = network.shape
+    keys = [IMAGE_PREFIX + name for name in shape.cameras] + [STATE] * bool(shape.state_dim)
+    return _one(network, as_batch(observation, keys))
+
+
+def _one(
+    network: HvsNetwork, batch: Mapping[str, Tensor]
+) -> tuple[dict[str, Tensor], Tensor | None]:
+    images = {name: batch[IMAGE_PREFIX + name][None] for name in network.shape.cameras}
+    return images, batch[STATE][None] if network.shape.state_dim else None
+
+
+def check_fit(config: Mapping[str, Any], folder: Path, spec: Spec) -> None:
+    """Check that a task shows what a checkpoint reads, in the same size, and takes its actions.
+
+    One of type `hvs` also has to be trained for such tasks; see `check_trained_for`.
+
+    Args:
+        config: Of the checkpoint.
+        folder: The checkpoint, for the message.
+        spec: The task.
+
+    Raises:
+        PolicyError: It does not fit.
+    """
+    if config.get("type") == "hvs":
+        check_trained_for(config, folder, spec)
+    shown = spec.observed
+    mismatch = f"{folder} does not fit {spec.name}: "
+    if spec.action_mode != "joint_position" or spec.normalise_observation:
+        raise PolicyError(
+            mismatch + "checkpoints read raw observations and command joint positions"
+        )
+    for key, feature in config["input_features"].items():
+        shape = tuple(feature["shape"])
+        name = key.removeprefix(IMAGE_PREFIX)
+        if key == STATE:
+            available = N_JOINTS * sum(
+                part in shown for part in ("joint_positions", "joint_velocities")
+            )
+            if "joint_positions" not in shown or shape != (available,):
+                raise PolicyError(
+                    mismatch + f"it reads {shape[0]} joint numbers, the task shows {available}"
+                )
+        elif (vector := key.removeprefix(VECTOR_PREFIX)) in spec.further_observations:
+            size = len(spec.further_observations[vector].dimensions)
+            if vector not in shown or shape != (size,):
+                raise PolicyError(mismatch + f"it reads {key}, which the task shows otherwise")
+        elif name == key or name not in shown or name not in ("eih", "eth"):
+            raise PolicyError(mismatch + f"it reads {key}, which the task does not show")
+        else:
+            side = getattr(spec, f"{name}_resolution")
+            expected = (getattr(spec, f"{name}_channels"), side, side)
+            if shape != expected:
+                raise PolicyError(
+                    mismatch + f"it reads {key} as {_size(shape)}, the task shows {_size(expected)}"
+                )
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return " x ".join(str(n) for n in (*shape[1:], shape[0]))
+
+
+def _processors_are_standard(folder: Path) -> bool:
+    """Whether the processors do nothing but add a batch dimension."""
+    for name, expected in STANDARD_STEPS.items():
+        steps = read_steps(folder, name)
+        if tuple(step.registry_name for step in steps) != expected:
+            return False
+        for step in steps:
+            modes = step.config.get("norm_map", {})
+            if step.config.get("rename_map") or not isinstance(modes, dict):
+                return False
+            if any(mode != "IDENTITY" for mode in modes.values()):
+                return False
+    return True
+
+
+class _Sizes(pydantic.BaseModel):
+    """What decides the size of an `hvs` network."""
+
+    model_config = pydantic.ConfigDict(extra="allow")
+
+    channels: Annotated[Size, pydantic.Field(ge=4)]
+    hidden: Annotated[Size, pydantic.Field(ge=4)]
+    error_scale: Annotated[float, pydantic.Field(gt=0.0, allow_inf_nan=False)]
+    residual_hidden: Annotated[int, pydantic.Field(strict=True, ge=0, le=MOST_SIZE)] = 0
+    residual_bound: Annotated[float, pydantic.Field(gt=0.0, allow_inf_nan=False)] = RESIDUAL_BOUND
+    from_set_point: Annotated[bool, pydantic.Field(strict=True)] = False
+
+
+def load_network(folder: Path, config: Mapping[str, Any]) -> HvsNetwork:
+    """Load the network of an `hvs` checkpoint, without LeRobot.
+
+    Args:
+        folder: The checkpoint.
+        config: Its ``config.json``, as `read_config` returns it.
+
+    Raises:
+        PolicyError: It cannot be loaded.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    read_settings(_Sizes, folder)
+    check_weights(folder, lambda: HvsNetwork(shape_from_config(config)), NETWORK_PREFIX)
+    try:
+        network = HvsNetwork(shape_from_config(config))
+        weights = load_file(folder / WEIGHTS)
+        network.load_state_dict({k.removeprefix(NETWORK_PREFIX): v for k, v in weights.items()})
+    except (SafetensorError, OSError, RuntimeError) as error:
+        raise PolicyError(
+            f"{folder} cannot be loaded as an hvs policy: {first_line(error)}"
+        ) from error
+    return network.eval()
+
+
+def weights_digest(folder: Path) -> str:
+    """SHA-256 of a checkpoint's weights.
+
+    Args:
+        folder: The checkpoint.
+
+    Raises:
+        PolicyError: It is no checkpoint, see `read_config`.
+    """
+    read_config(folder)
+    with (folder / WEIGHTS).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _network(folder: Path, config: Mapping[str, Any]) -> tuple[Decide, Callable[[], None]]:
+    """Play the network of an `hvs` checkpoint by itself."""
+    network = load_network(folder, config)
+    if not network.shape.state_dim:
+        return lambda batch: network.to_action(network(*_one(network, batch)).out, None), _nothing
+    compiled = CompiledNetwork(network)
+    memory: Tensor | None = None
+
+    def decide(batch: dict[str, Tensor]) -> Tensor:
+        nonlocal memory
+        images, state = _one(network, batch)
+        assert state is not None
+        action, memory = compiled(images, state, memory)
+        return action
+
+    def forget() -> None:
+        nonlocal memory
+        memory = None
+
+    return decide, forget
+
+
+def _nothing() -> None:
+    """Forget nothing: a policy without joints has no memory."""
+
+
+def _lerobot(folder: Path) -> tuple[Decide, Callable[[], None]]:
+    """Load any LeRobot policy with its processors, on the CPU."""
+    try:
+        from lerobot.configs import PreTrainedConfig
+        from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+    except ImportError as error:
+        raise PolicyError("LeRobot is missing; install hvs-suite[learn]") from error
+    import hvs_suite.policies.hvs.configuration_hvs  # noqa: F401 - registers the type
+
+    try:
+        config = PreTrainedConfig.from_pretrained(folder, local_files_only=True)
+        config.device = "cpu"
+        if hasattr(config, "pretrained_backbone_weights"):
+            # Where training began; fetched, although the checkpoint's own weights replace them.
+            config.pretrained_backbone_weights = None
+        check_sizes(folder, vars(config))
+        policy_class = get_policy_class(config.type)
+        check_weights(folder, lambda: policy_class(config))
+        policy = policy_class.from_pretrained(folder, config=config, local_files_only=True)
+        before, after = make_pre_post_processors(
+            config,
+            pretrained_path=str(folder),
+            preprocessor_overrides={"device_processor": {"device": "cpu"}},
+        )
+    except PolicyError:
+        raise
+    except Exception as error:  # LeRobot and what it loads raise anything
+        raise PolicyError(f"LeRobot cannot load {folder}: {first_line(error)}") from error
+
+    def decide(batch: Batch) -> Tensor:
+        action: Tensor = after(policy.select_action(before(batch)))
+        return action
+
+    return decide, policy.reset

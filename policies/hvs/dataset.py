@@ -1,0 +1,235 @@
+"""A recorded LeRobot dataset as the `hvs` policy reads it: description, columns, camera maps.
+
+Reads the dataset's own files (format v3, frames as images) without importing LeRobot's dataset
+package, which takes longer than opening a small dataset.
+"""
+
+import dataclasses
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hvs_suite.datasets import reader
+from hvs_suite.datasets.features import ACTION, ACTION_EXECUTED, dataset_features
+from hvs_suite.datasets.metadata import read_metadata
+from hvs_suite.errors import DatasetError, OptionError, UnknownTaskError
+from hvs_suite.policies.hvs.geometry import Calibration, calibrate
+from hvs_suite.policies.hvs.network import IMAGE_PREFIX, N_JOINTS, STATE
+from hvs_suite.registry import find
+from hvs_suite.tasks.shared.placing import PlacingSpec
+
+EPISODE = "episode_index"
+GOAL_POSITION = "privileged.goal_position"
+GOAL_NORMAL = "privileged.goal_normal"
+TARGET_PREFIX = "privileged.target_"
+JOINTS = "joints"
+
+Column = npt.NDArray[Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Manifest:
+    """What a dataset says of itself.
+
+    Attributes:
+        root: The dataset.
+        task: Named task that it was recorded on.
+        split: Split of its scenarios.
+        options: Task options that differ from the named task's.
+        features: LeRobot's features by key.
+        n_frames: Frames.
+        n_episodes: Episodes.
+    """
+
+    root: Path
+    task: str
+    split: str
+    options: Mapping[str, Any]
+    features: Mapping[str, Mapping[str, Any]]
+    n_frames: int
+    n_episodes: int
+
+    @property
+    def cameras(self) -> dict[str, tuple[int, int, int]]:
+        """Camera name to (H, W, C) of its frames."""
+        return {
+            key.removeprefix(IMAGE_PREFIX): (shape[0], shape[1], shape[2])
+            for key, feature in sorted(self.features.items())
+            if key.startswith(IMAGE_PREFIX)
+            for shape in [feature["shape"]]
+        }
+
+    @property
+    def trained_keys(self) -> list[str]:
+        """The features that training reads: images, state, actions, targets, goal."""
+        wanted = {STATE, ACTION, ACTION_EXECUTED, GOAL_POSITION, GOAL_NORMAL}
+        wanted |= {TARGET_PREFIX + name for name in self.cameras}
+        wanted |= {IMAGE_PREFIX + name for name in self.cameras}
+        return [key for key in self.features if key in wanted]
+
+    def with_inputs(self, names: Collection[str]) -> "Manifest":
+        """The same dataset for a policy that is given less.
+
+        Args:
+            names: Of ``eih``, ``eth`` and ``joints``.
+
+        Raises:
+            OptionError: A name is unknown, or no camera is left.
+        """
+        available = {**{name: IMAGE_PREFIX + name for name in self.cameras}, JOINTS: STATE}
+        if unknown := sorted(set(names) - set(available)):
+            raise OptionError(f"unknown input {unknown[0]!r}; choose from {', '.join(available)}")
+        if not set(names) & set(self.cameras):
+            raise OptionError("no camera is left to see the target with; keep eih or eth")
+        dropped = {key for name, key in available.items() if name not in names}
+        features = {key: value for key, value in self.features.items() if key not in dropped}
+        return dataclasses.replace(self, features=features)
+
+
+def read_manifest(root: Path) -> Manifest:
+    """Read ``meta/info.json`` and ``hvs.json``.
+
+    Args:
+        root: The dataset.
+
+    Returns:
+        The manifest.
+
+    Raises:
+        DatasetError: There is no such dataset, it is empty, or it was not recorded by this suite.
+    """
+    try:
+        info = reader.read_info(root)
+    except DatasetError as error:
+        raise DatasetError(f"{root} is not a LeRobot dataset: {error}") from error
+    origin = read_metadata(root)
+    manifest = Manifest(
+        root=root,
+        task=origin.task,
+        split=origin.split,
+        options=origin.options,
+        features=info["features"],
+        n_frames=info["total_frames"],
+        n_episodes=info["total_episodes"],
+    )
+    try:
+        wanted = dataset_features(find(origin.task).with_options(origin.options))
+    except (UnknownTaskError, OptionError) as error:
+        raise DatasetError(f"{root}: hvs.json: {error}") from error
+    for key in manifest.trained_keys:
+        found = list(manifest.features[key]["shape"])
+        # Pictures may be smaller than the task's; their size is held against the files.
+        if key.startswith(IMAGE_PREFIX):
+            continue
+        right = list(wanted[key]["shape"]) if key in wanted else "recorded on this task"
+        if found != right:
+            raise DatasetError(f"{root}: meta/info.json: {key} has shape {found}, not {right}")
+    if manifest.n_frames == 0:
+        raise DatasetError(f"{root} is empty; record at least two episodes")
+    return manifest
+
+
+def refuse_test_split(manifest: Manifest) -> None:
+    """Keep the scenarios that policies are scored on out of training.
+
+    Args:
+        manifest: Of the dataset.
+
+    Raises:
+        DatasetError: It was recorded on ``test``.
+    """
+    if manifest.split == "test":
+        raise DatasetError(
+            f"{manifest.root} was recorded on the test split, which scores policies; "
+            "record with --split train"
+        )
+
+
+def read_columns(manifest: Manifest) -> dict[str, Column]:
+    """Read the columns that training uses: state, actions, targets, goal, episode.
+
+    Returns:
+        Key to (n_frames, k) float32; ``episode_index`` to (n_frames,) int64.
+    """
+    keys = [key for key in manifest.trained_keys if not key.startswith(IMAGE_PREFIX)]
+    if ACTION not in keys or not manifest.cameras:
+        raise DatasetError(f"{manifest.root} needs an action and at least one camera to learn from")
+    parts: dict[str, list[Column]] = {key: [] for key in [*keys, EPISODE]}
+    for path in reader.data_files(manifest.root):
+        name = path.relative_to(manifest.root).as_posix()
+        table = reader.read_table(manifest.root, name, [*keys, EPISODE])
+        with reader.in_file(manifest.root, name):
+            for key in keys:
+                values = reader.column(table, key)
+                declared = tuple(manifest.features[key]["shape"])
+                if values.shape[1:] != declared:
+                    raise DatasetError(f"{key} has shape {values.shape[1:]}, not {declared}")
+                values = values.astype(np.float32)
+                astray = np.flatnonzero(~np.isfinite(values).all(axis=tuple(range(1, values.ndim))))
+                if len(astray):
+                    raise DatasetError(
+                        f"{key} holds NaN or infinity in {len(astray)} rows, row {astray[0]} "
+                        "first; record the dataset again"
+                    )
+                parts[key].append(values)
+            index = reader.column(table, EPISODE)
+            if index.ndim != 1:
+                raise DatasetError(f"{EPISODE}: a row holds no number")
+            parts[EPISODE].append(index.astype(np.int64))
+    columns = {key: np.concatenate(arrays) for key, arrays in parts.items()}
+    if len(columns[EPISODE]) != manifest.n_frames:
+        raise DatasetError(
+            f"{manifest.root} declares {manifest.n_frames} frames but holds "
+            f"{len(columns[EPISODE])}; record it again"
+        )
+    return columns
+
+
+def calibration_of(root: Path, episodes: int | None = None) -> Calibration:
+    """Fit the camera maps of the `hvs` network to a dataset's privileged columns.
+
+    Args:
+        root: The dataset.
+        episodes: Fit them to the first so many episodes alone; None to all.
+
+    Returns:
+        The calibration.
+
+    Raises:
+        DatasetError: The dataset lacks the columns.
+    """
+    manifest = read_manifest(root)
+    columns = read_columns(manifest)
+    missing = {STATE, GOAL_POSITION, GOAL_NORMAL} - set(columns)
+    if missing:
+        raise DatasetError(f"{root} lacks {', '.join(sorted(missing))}")
+    return calibrate_on(manifest, columns, episodes)
+
+
+def calibrate_on(
+    manifest: Manifest, columns: Mapping[str, Column], episodes: int | None
+) -> Calibration:
+    """As `calibration_of`, of columns that have been read."""
+    known = np.isin(columns[EPISODE], np.unique(columns[EPISODE])[:episodes])
+    double = {key: column[known].astype(np.float64) for key, column in columns.items()}
+    return calibrate(
+        q=double[STATE][:, :N_JOINTS],
+        goal_position=double[GOAL_POSITION],
+        goal_normal=double[GOAL_NORMAL],
+        standoff_m=_standoff(manifest),
+        target_eih=double.get(TARGET_PREFIX + "eih"),
+        target_eth=double.get(TARGET_PREFIX + "eth"),
+    )
+
+
+def _standoff(manifest: Manifest) -> float:
+    spec = find(manifest.task).with_options(manifest.options)
+    if not isinstance(spec, PlacingSpec):
+        raise DatasetError(
+            f"{manifest.root} was recorded on {manifest.task}; this policy knows targets on a "
+            "level surface alone"
+        )
+    return spec.standoff_m

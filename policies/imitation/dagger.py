@@ -1,0 +1,258 @@
+"""DAgger: the policy plays, the expert says at every step what it would have done instead.
+
+Cloning shows the policy only where the expert goes; a policy that errs a little soon stands where
+nobody has shown it anything. Frames of the policy's own episodes under the expert's labels mend
+that (Ross, Gordon and Bagnell, 2011: https://arxiv.org/abs/1011.0686).
+"""
+
+import contextlib
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hvs_suite.datasets.demonstration import MakeEnvironment
+from hvs_suite.datasets.features import ACTION, ACTION_EXECUTED, Frame, observed_part
+from hvs_suite.datasets.looking import Demonstrator
+from hvs_suite.datasets.recorder import in_order
+from hvs_suite.errors import OutputError
+from hvs_suite.policies.checkpoints.loading import CheckpointFactory
+from hvs_suite.policies.hvs.dataset import Manifest
+from hvs_suite.policies.hvs.network import IMAGE_PREFIX
+from hvs_suite.policies.imitation.demonstrations import Recording
+from hvs_suite.policies.imitation.frame_cache import new_frames, open_frames
+from hvs_suite.rollout import Policy, play, tell
+
+if TYPE_CHECKING:
+    from hvs_suite.tasks.shared.environment import Environment
+
+FIRST_SHARE = 0.35
+LAST_SHARE = 0.80
+"""The rounds are spread over this part of the training: before, the policy errs anyhow; after, no
+time would be left to learn from them."""
+COLUMNS = "columns.npz"
+SUMMARY = "round.json"
+
+
+def round_shares(rounds: int) -> list[float]:
+    """At which part of the training each round is played.
+
+    Args:
+        rounds: How many.
+
+    Returns:
+        Shares of the training budget, rising, (rounds,).
+    """
+    return [float(share) for share in np.linspace(FIRST_SHARE, LAST_SHARE, max(rounds, 2))[:rounds]]
+
+
+@dataclasses.dataclass(frozen=True)
+class PlayedEpisode:
+    """An episode that the policy played.
+
+    Attributes:
+        scenario: Index in the split.
+        frames: One a control step, with the expert's ``action`` where it was asked.
+        success: The goal was reached.
+        collision: A forbidden contact ended it.
+    """
+
+    scenario: int
+    frames: list[Frame]
+    success: bool
+    collision: bool
+
+
+def watch(env: "Environment", policy: Policy, scenario: int) -> PlayedEpisode:
+    """Play one scenario with the policy and keep what it saw, asking no expert.
+
+    Args:
+        env: The task.
+        policy: Who plays.
+        scenario: Index in the split.
+
+    Returns:
+        The episode, its frames without ``action``.
+    """
+    return _played(env, policy, scenario, dict)
+
+
+def correct(env: "Environment", policy: Policy, scenario: int) -> PlayedEpisode:
+    """Play one scenario with the policy and label each frame by the expert.
+
+    Args:
+        env: The task.
+        policy: Who plays.
+        scenario: Index in the split.
+
+    Returns:
+        The episode.
+    """
+    expert = Demonstrator(env)
+    return _played(env, policy, scenario, lambda: {ACTION: expert.label()})
+
+
+def _played(
+    env: "Environment", policy: Policy, scenario: int, label: Callable[[], Frame]
+) -> PlayedEpisode:
+    time_step = env.reset(scenario=scenario)
+    tell(policy, env)
+    policy.reset()
+    frames: list[Frame] = []
+    while not time_step.last():
+        frame = observed_part(env.spec, time_step.observation, env)
+        labelled = frame | label()
+        action = np.clip(policy.select_action(time_step.observation), -1.0, 1.0).astype(np.float32)
+        frames.append(labelled | {ACTION_EXECUTED: action})
+        time_step = env.step(action)
+    info = env.info
+    return PlayedEpisode(scenario, frames, info["is_success"], info["collision"])
+
+
+@dataclasses.dataclass(frozen=True)
+class RoundSummary:
+    """What a round came to.
+
+    Attributes:
+        frames: Frames kept.
+        episodes: Episodes played.
+        successes: Those that reached the goal.
+        collisions: Those that ended in a forbidden contact.
+        first_scenario: Index of the first, in the dataset's split.
+        next_scenario: Where the next round goes on.
+    """
+
+    frames: int
+    episodes: int
+    successes: int
+    collisions: int
+    first_scenario: int
+    next_scenario: int
+
+
+def play_round(
+    manifest: Manifest,
+    checkpoint: Path,
+    folder: Path,
+    *,
+    frames: int,
+    first_scenario: int,
+    workers: int,
+    labelled: bool = True,
+    on_frames: Callable[[int], None] | None = None,
+) -> RoundSummary:
+    """Play scenarios until enough frames are there, and keep them on disk.
+
+    Args:
+        manifest: Of the dataset: task, split, options and columns are the same.
+        checkpoint: The policy that plays.
+        folder: Gets the round, whole or not at all.
+        frames: How many to keep.
+        first_scenario: Index to begin with; give one that the dataset does not hold.
+        workers: Processes that play. The result is the same for any number.
+        labelled: Ask the expert at every step what it would have done.
+        on_frames: Called with the number of frames just kept.
+
+    Returns:
+        What the round came to.
+
+    Raises:
+        OutputError: The folder cannot be written.
+    """
+    scratch = folder.with_name(f".{folder.name}")
+    keys = {
+        key: manifest.features[key] for key in manifest.trained_keys if labelled or key != ACTION
+    }
+    played = play(
+        MakeEnvironment(manifest.task, manifest.split, dict(manifest.options)),
+        CheckpointFactory(str(checkpoint.resolve())),
+        # No episode is without a frame, so these are enough.
+        range(first_scenario, first_scenario + frames),
+        correct if labelled else watch,
+        workers=workers,
+    )
+    try:
+        shutil.rmtree(scratch, ignore_errors=True)
+        scratch.mkdir(parents=True)
+        store = _Store(scratch, keys, frames)
+        episodes = successes = collisions = 0
+        with contextlib.closing(played):
+            for episode in in_order(played, first_scenario):
+                kept = store.append(episode.frames, first_scenario + episodes)
+                episodes += 1
+                successes += episode.success
+                collisions += episode.collision
+                if on_frames is not None:
+                    on_frames(kept)
+                if store.is_full:
+                    break
+        store.close()
+        summary = RoundSummary(
+            frames, episodes, successes, collisions, first_scenario, first_scenario + episodes
+        )
+        (scratch / SUMMARY).write_text(json.dumps(dataclasses.asdict(summary), indent=2) + "\n")
+        scratch.replace(folder)
+    except OSError as error:
+        raise OutputError(f"cannot write {folder}: {error.strerror or error}") from error
+    return summary
+
+
+def read_round(folder: Path) -> tuple[RoundSummary, Recording] | None:
+    """Open a round.
+
+    Args:
+        folder: That `play_round` wrote.
+
+    Returns:
+        What it came to and its frames, memory-mapped; None if it was not played.
+    """
+    if not (folder / SUMMARY).exists():
+        return None
+    summary = RoundSummary(**json.loads((folder / SUMMARY).read_text()))
+    with np.load(folder / COLUMNS, allow_pickle=False) as file:
+        columns = dict(file)
+    images = {path.stem: open_frames(path) for path in sorted(folder.glob(f"{IMAGE_PREFIX}*.npy"))}
+    return summary, Recording(columns, images)
+
+
+class _Store:
+    """Frames on disk: images memory-mapped, numbers in memory until the end."""
+
+    def __init__(self, folder: Path, keys: Mapping[str, Mapping[str, Any]], frames: int) -> None:
+        self._folder = folder
+        self._frames = frames
+        self._filled = 0
+        self._episodes = np.zeros(frames, np.int64)
+        self._images: dict[str, Any] = {}
+        self._columns: dict[str, npt.NDArray[np.float32]] = {}
+        for key, feature in keys.items():
+            shape = (frames, *feature["shape"])
+            if key.startswith(IMAGE_PREFIX):
+                self._images[key] = new_frames(folder / f"{key}.npy", shape)
+            else:
+                self._columns[key] = np.zeros(shape, np.float32)
+
+    @property
+    def is_full(self) -> bool:
+        return self._filled == self._frames
+
+    def append(self, frames: list[Frame], episode: int) -> int:
+        """Keep the frames that still fit; their number."""
+        kept = frames[: self._frames - self._filled]
+        for frame in kept:
+            for arrays in (self._images, self._columns):
+                for key, array in arrays.items():
+                    array[self._filled] = frame[key]
+            self._episodes[self._filled] = episode
+            self._filled += 1
+        return len(kept)
+
+    def close(self) -> None:
+        for image in self._images.values():
+            image.flush()
+        np.savez(self._folder / COLUMNS, episode_index=self._episodes, **self._columns)  # type: ignore[arg-type]

@@ -1,0 +1,198 @@
+"""What a training run is a function of, and the fresh policy that it starts with."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import nn
+
+from hvs_suite.datasets.features import ACTION_EXECUTED
+from hvs_suite.errors import OptionError, PolicyError
+from hvs_suite.policies.checkpoints.files import read_config
+from hvs_suite.policies.checkpoints.loading import load_network, weights_digest
+from hvs_suite.policies.hvs.dataset import Manifest, calibration_of
+from hvs_suite.policies.hvs.network import IMAGE_PREFIX, STATE, Eye
+from hvs_suite.policies.imitation.frame_cache import fingerprint
+from hvs_suite.policies.trained_for import trained_for
+from hvs_suite.registry import find
+
+if TYPE_CHECKING:
+    from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings:
+    """All that decides what a run learns, the budget aside.
+
+    Attributes:
+        seed: Of initial weights, held-out episodes and order.
+        batch_size: Frames a step.
+        learning_rate: Peak of the schedule (a short warm-up, then a cosine to zero).
+        dagger_rounds: How often to let the policy play, the expert labelling every step, and to add
+            those frames.
+        dagger_frames: Frames a round.
+        dataset: Fingerprint of the dataset.
+        task: Named task that it was recorded on.
+        inputs: What the policy is given, of ``eih``, ``eth`` and ``joints``; None for all.
+        episodes: Learn from the first so many demonstrations alone; None from all.
+        rehearsal_frames: Frames a step that the head alone learns from, without their images; see
+            `hvs_suite.policies.hvs.rehearsal`.
+        keypoint_weight: Weight of the supervision by ``privileged.*``; 0 trains on actions alone.
+        error_scale: See `HvsConfig`.
+        eyes: SHA-256 of the weights whose eyes it begins with; None for fresh ones.
+    """
+
+    seed: int = 0
+    batch_size: int = 64
+    learning_rate: float = 2e-3
+    dagger_rounds: int = 0
+    dagger_frames: int = 6000
+    dataset: str
+    task: str
+    inputs: tuple[str, ...] | None = None
+    episodes: int | None = None
+    rehearsal_frames: int = 512
+    keypoint_weight: float = 1.0
+    error_scale: float
+    eyes: str | None = None
+
+    def check(self, manifest: Manifest) -> None:
+        """Refuse numbers that make no sense.
+
+        Args:
+            manifest: Of the dataset.
+
+        Raises:
+            OptionError: There is one.
+        """
+        for name in ("batch_size", "dagger_frames"):
+            if getattr(self, name) < 1:
+                raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if not 0.0 < self.learning_rate < 1.0:
+            raise OptionError(f"learning_rate must be between 0 and 1, not {self.learning_rate}")
+        for name in ("dagger_rounds", "rehearsal_frames"):
+            if getattr(self, name) < 0:
+                raise OptionError(f"{name} must be 0 or more, not {getattr(self, name)}")
+        if self.episodes is not None and not 1 <= self.episodes <= manifest.n_episodes:
+            raise OptionError(
+                f"episodes must be 1 to the dataset's {manifest.n_episodes}, not {self.episodes}"
+            )
+        if not 0.0 <= self.keypoint_weight < math.inf:
+            raise OptionError(f"keypoint_weight must be 0 or more, not {self.keypoint_weight}")
+        if not 0.0 < self.error_scale < math.inf:
+            raise OptionError(f"error_scale must be above 0, not {self.error_scale}")
+
+
+def settings_for(manifest: Manifest, eyes: Path | None, chosen: Mapping[str, Any]) -> Settings:
+    """The settings of a run on a dataset.
+
+    Args:
+        manifest: Of the dataset.
+        eyes: Checkpoint of a policy to take the eyes of; None for fresh ones.
+        chosen: Fields that differ from the defaults; ``error_scale`` is five times the task's
+            tightest tolerance (m) where it is None.
+
+    Raises:
+        OptionError: A number makes no sense.
+    """
+    chosen = dict(chosen)
+    if chosen.get("error_scale") is None:
+        task = find(manifest.task).with_options(manifest.options)
+        chosen["error_scale"] = 5e-3 * task.tightest_tolerance_mm
+    settings = Settings(
+        **chosen,
+        dataset=fingerprint(manifest.root),
+        task=manifest.task,
+        eyes=None if eyes is None else weights_digest(eyes),
+    )
+    settings.check(manifest)
+    return settings
+
+
+def trails_its_set_point(manifest: Manifest) -> bool:
+    """Whether the arm goes on for steps after it was told to stop, and the dataset says where to.
+
+    Args:
+        manifest: Of the dataset.
+    """
+    task = find(manifest.task).with_options(manifest.options)
+    return task.latency_steps > 0 and ACTION_EXECUTED in manifest.features
+
+
+def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":
+    """A fresh policy for a dataset's inputs, its cameras calibrated from what it is to learn from.
+
+    Args:
+        manifest: Of the dataset, with the inputs that the policy is to have.
+        settings: Of the run.
+    """
+    from lerobot.configs import FeatureType, PolicyFeature
+
+    from hvs_suite.policies.hvs.configuration_hvs import HvsConfig
+    from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
+
+    inputs = {
+        IMAGE_PREFIX + name: PolicyFeature(FeatureType.VISUAL, (shape[2], shape[0], shape[1]))
+        for name, shape in manifest.cameras.items()
+    }
+    if STATE in manifest.features:
+        shape = tuple(manifest.features[STATE]["shape"])
+        inputs[STATE] = PolicyFeature(FeatureType.STATE, shape)
+    config = HvsConfig(
+        input_features=inputs,
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},
+        device="cpu",
+        push_to_hub=False,
+        optimizer_lr=settings.learning_rate,
+        keypoint_weight=settings.keypoint_weight,
+        error_scale=settings.error_scale,
+        from_set_point=STATE in inputs and trails_its_set_point(manifest),
+        **trained_for(find(manifest.task).with_options(manifest.options)).model_dump(),
+    )
+    # torch initialises weights from its global generator; leave that as it was found.
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.seed)
+        policy = HvsPolicy(config)
+    if STATE in manifest.features:
+        policy.network.set_calibration(calibration_of(manifest.root, settings.episodes))
+    for module in policy.modules():
+        if isinstance(module, Eye):
+            module.train_in_bfloat16 = torch.cpu._is_avx512_bf16_supported()
+    return policy
+
+
+def take_eyes(policy: "HvsPolicy", folder: Path) -> None:
+    """Begin with the eyes of another policy, for each camera whose layers are alike.
+
+    Eyes that found larger targets find smaller ones soon; fresh ones may never get to see a target
+    of three pixels (docs/experiments/small-targets.md).
+
+    Args:
+        policy: Whose eyes to replace.
+        folder: Checkpoint of an `hvs` policy.
+
+    Raises:
+        PolicyError: It is none, or no camera has the same layers in both.
+    """
+    config = read_config(folder)
+    if config.get("type") != "hvs":
+        raise PolicyError(f"{folder} holds a policy of type {config.get('type')}, not hvs")
+    others = load_network(folder, config).eyes
+    eyes = policy.network.eyes
+    alike = [
+        name for name in eyes if name in others and _shapes(eyes[name]) == _shapes(others[name])
+    ]
+    if not alike:
+        raise PolicyError(
+            f"{folder} has no eyes that fit {', '.join(eyes)}: their layers depend on the images' "
+            "sides and channels"
+        )
+    for name in alike:
+        eyes[name].load_state_dict(others[name].state_dict())
+
+
+def _shapes(module: nn.Module) -> dict[str, torch.Size]:
+    return {name: weight.shape for name, weight in module.state_dict().items()}
