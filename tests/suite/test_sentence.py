@@ -12,10 +12,10 @@ import hvs_suite
 from hvs_suite.datasets import reader
 from hvs_suite.datasets.check import check_dataset
 from hvs_suite.datasets.recorder import record
-from hvs_suite.eval import wire
-from hvs_suite.eval.policy_session import Session
-from hvs_suite.eval.remote_policy import hello
-from hvs_suite.eval.trial import PlayTrial
+from hvs_suite.eval.scoring.trial import PlayTrial
+from hvs_suite.eval.serving import wire
+from hvs_suite.eval.serving.policy_session import Session
+from hvs_suite.eval.serving.remote_policy import hello
 from hvs_suite.gym import PixelsAgentPos, TaskEnv
 from hvs_suite.rollout import Observation, run_episode
 from hvs_suite.tasks.clutter import COLOURS
