@@ -162,7 +162,8 @@ def _bits(number: int) -> int:
 @functools.cache
 def _via_points() -> FloatArray:
     """The upright arm and postures well above the surface, (n, 7) rad, the last joint at zero."""
-    model, found = kinematics(), [np.zeros(7)]
+    model = kinematics()
+    found: list[FloatArray] = [np.zeros(7)]
     bound = _VIA_RANGE * robot.JOINT_RANGE_RAD[:6]
     sequence = qmc.Halton(6, scramble=False)
     sequence.fast_forward(1)

@@ -15,7 +15,7 @@ the paint shows.
 import dataclasses
 import math
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -42,7 +42,7 @@ FloatArray = npt.NDArray[np.float64]
 COLOURS = ("red", "blue", "green", "yellow")
 """Of the discs; the same as the cell's paints, spelled out because those load MuJoCo."""
 GOAL_COLOUR = "goal_colour"
-OUTLINES = ("square", "ring", "half disc")
+OUTLINES: tuple[Literal["square", "ring", "half disc"], ...] = ("square", "ring", "half disc")
 """What is not the target although it has its colour."""
 MAX_OBSTACLES = 6
 MAX_HEIGHT_M = 0.50
@@ -204,7 +204,9 @@ class Clutter(Placing[ClutterSpec, ClutterScenario]):
         spec = self.spec
         if not spec.n_distractors[1]:
             return []
-        kinds = [("disc", colour) for colour in COLOURS if colour not in spec.colours]
+        kinds: "list[tuple[Shape, str]]" = [
+            ("disc", colour) for colour in COLOURS if colour not in spec.colours
+        ]
         kinds += [(outline, colour) for outline in OUTLINES for colour in spec.colours]
         # Two of each, and more where that is not enough.
         count = max(2 * len(kinds), spec.n_distractors[1])
@@ -226,7 +228,8 @@ class Clutter(Placing[ClutterSpec, ClutterScenario]):
         start = draw_start(spec, own, streams, goal, goal.normal)
         colour = spec.colours[streams.generator("goal_colour").integers(len(spec.colours))]
         placed = self._lay_out(streams.generator("things"), colour, goal)
-        way, motion = np.zeros((0, 7)), None
+        way: FloatArray = np.zeros((0, 7))
+        motion = None
         if spec.n_obstacles[1]:
             way, standing = self._obstacles.draw(streams.generator("obstacles"), start, goal)
             placed += standing

@@ -41,7 +41,7 @@ _SAMPLES = 8
 def straight(here: FloatArray, there: FloatArray) -> FloatArray:
     """Postures (n, 7) of a straight joint motion, both ends included, at most 0.06 rad apart."""
     count = 2 + int(np.abs(there - here).max() / _STEP_RAD)
-    return np.linspace(here, there, count)
+    return np.asarray(np.linspace(here, there, count), np.float64)
 
 
 def draw_way(random: np.random.Generator, start: FloatArray, goal: Goal) -> FloatArray:
