@@ -27,7 +27,7 @@ from hvs_suite.datasets.metadata import METADATA_FILE, DatasetMetadata, read_met
 from hvs_suite.datasets.moments import Moments, compare, compare_all, merge, sample
 from hvs_suite.datasets.reader import DamagedFileError, Place
 from hvs_suite.datasets.resimulation import resimulate
-from hvs_suite.errors import DatasetError, HvsError
+from hvs_suite.errors import DatasetError, HvsError, ScenarioError
 from hvs_suite.names import shown
 from hvs_suite.registry import find
 from hvs_suite.rollout import play
@@ -126,17 +126,24 @@ def check_dataset(
     except DamagedFileError as error:
         return Report(0, 0, (Damage.of(error),))
     damage += _check_info(info, features, spec, places)
-    damage += _check_sentence(root, spec)
+    sentences = _read_sentences(root, damage)
     damage += _check_order(places)
     damage += _check_videos(info, places)
     unreadable, in_files = _check_files(root, places)
     damage += in_files
     sound = [place for place in places if place.file not in unreadable]
     job = CheckEpisode(
-        root, metadata, {place.episode: place for place in sound}, features, info, pictures
+        root,
+        metadata,
+        {place.episode: place for place in sound},
+        features,
+        info,
+        sentences,
+        pictures,
     )
     options = dict(metadata.options) if pictures else {**metadata.options, "observations": "state"}
     merged: dict[str, list[Moments]] = {}
+    said: dict[int, str] = {}
     checked = frames = 0
     with contextlib.closing(
         play(
@@ -149,6 +156,8 @@ def check_dataset(
     ) as played:
         for found in played:
             damage += found.damage
+            if found.sentence:
+                said[found.episode] = found.sentence
             checked, frames = checked + 1, frames + found.frames
             for name, moments in found.moments.items():
                 merged.setdefault(name, []).append(moments)
@@ -161,6 +170,10 @@ def check_dataset(
         # A feature that some episode could not give has no statistics to compare.
         whole = {name: each for name, each in merged.items() if len(each) == checked}
         damage += _check_statistics(root, info, features, whole)
+        wanted = list(dict.fromkeys(said[episode] for episode in sorted(said)))
+        if sentences and wanted and sentences != wanted:
+            what = f"{sentences} is not what the episodes are about, {wanted}"
+            damage.append(Damage(reader.TASKS, None, None, what))
     return Report(checked, frames, tuple(sorted(set(damage), key=_order)))
 
 
@@ -173,12 +186,14 @@ class EpisodeFindings:
         frames: Rows found.
         damage: Every damaged place.
         moments: Of each feature.
+        sentence: What was to be done, by the scenario; empty where that is damaged.
     """
 
     episode: int
     frames: int
     damage: list[Damage]
     moments: dict[str, Moments]
+    sentence: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,6 +206,7 @@ class CheckEpisode:
         places: Where each episode lies.
         features: The features it must have.
         info: ``meta/info.json``.
+        sentences: ``meta/tasks.parquet``; empty where it is damaged.
         pictures: Draw every frame again.
     """
 
@@ -199,6 +215,7 @@ class CheckEpisode:
     places: Mapping[int, Place]
     features: Mapping[str, Mapping[str, Any]]
     info: Mapping[str, Any]
+    sentences: list[str]
     pictures: bool
 
     def __call__(self, env: Any, policy: Any, episode: int) -> EpisodeFindings:
@@ -211,7 +228,8 @@ class CheckEpisode:
             findings.damage.append(Damage.of(error, episode))
             return findings
         columns = self._columns(place, table, findings)
-        self._check_numbering(place, columns, findings)
+        sentence = _sentence(env, columns)
+        self._check_numbering(place, columns, sentence, findings)
         lossy = bool(place.videos)
         decoded = {
             key: self._decode(place, table, key, findings)
@@ -232,7 +250,7 @@ class CheckEpisode:
                 findings.damage.append(
                     Damage(place.file, episode, each.frame, f"{each.column}: {each.what}")
                 )
-        return dataclasses.replace(findings, frames=table.num_rows)
+        return dataclasses.replace(findings, frames=table.num_rows, sentence=sentence)
 
     def _columns(
         self, place: Place, table: pa.Table, findings: EpisodeFindings
@@ -266,7 +284,11 @@ class CheckEpisode:
         return own | {name: {"shape": (1,)} for name in LEROBOT_COLUMNS}
 
     def _check_numbering(
-        self, place: Place, columns: Mapping[str, npt.NDArray[Any]], findings: EpisodeFindings
+        self,
+        place: Place,
+        columns: Mapping[str, npt.NDArray[Any]],
+        sentence: str,
+        findings: EpisodeFindings,
     ) -> None:
         """Indices, timestamps, ends and scenario: one after the other, without a hole."""
         count = len(next(iter(columns.values()))) if columns else 0
@@ -284,8 +306,9 @@ class CheckEpisode:
             "frame_index": steps,
             "index": place.start + steps,
             "timestamp": steps / fps,
-            "task_index": np.zeros(count),
         }
+        if sentence in self.sentences:
+            expected["task_index"] = np.full(count, self.sentences.index(sentence))
         for name, wanted in expected.items():
             if name in columns:
                 wrong = np.flatnonzero(np.abs(columns[name] - wanted) > _TIME_TOLERANCE_S)
@@ -440,14 +463,23 @@ def _check_info(
     return [Damage(reader.INFO, None, None, what) for what in wrong]
 
 
-def _check_sentence(root: Path, spec: Spec) -> list[Damage]:
+def _read_sentences(root: Path, damage: list[Damage]) -> list[str]:
+    """What the episodes are about; empty, and damage, where that cannot be read."""
     try:
-        sentences = reader.read_sentences(root)
+        return reader.read_sentences(root)
     except DamagedFileError as error:
-        return [Damage.of(error)]
-    if sentences != [spec.instruction()]:
-        return [Damage(reader.TASKS, None, None, f"{sentences} is not the task's sentence")]
-    return []
+        damage.append(Damage.of(error))
+        return []
+
+
+def _sentence(env: Any, columns: Mapping[str, npt.NDArray[Any]]) -> str:
+    """What was to be done in an episode, by its scenario; empty where that is damaged."""
+    scenarios = np.ravel(columns.get(SCENARIO, ()))
+    try:
+        scene = env.task.source.draw(int(scenarios[0]))
+    except (IndexError, ScenarioError):
+        return ""
+    return str(env.spec.instruction(scene))
 
 
 def _check_order(places: list[Place]) -> list[Damage]:

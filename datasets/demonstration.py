@@ -50,6 +50,7 @@ class Demonstration:
         length: Control steps, one frame each.
         columns: The columns of :mod:`hvs_suite.datasets.features`: (n, k), or n PNG files.
         shades: Pixels of each column of pictures, counted.
+        task: What was to be done, as a sentence.
         success: The goal was reached.
         collision: A forbidden contact ended it.
     """
@@ -58,6 +59,7 @@ class Demonstration:
     length: int
     columns: dict[str, npt.NDArray[Any] | list[bytes]]
     shades: dict[str, Shades]
+    task: str
     success: bool
     collision: bool
 
@@ -129,7 +131,8 @@ class Demonstrate:
         for camera, drawn in env.pictures(moments).items():
             for frame, picture in zip(frames, drawn, strict=True):
                 frame[image_key(camera)] = picture
-        return packed(scenario, frames, dataset_features(env.spec), env.info)
+        features = dataset_features(env.spec)
+        return packed(scenario, frames, features, env.info, env.instruction)
 
 
 @contextlib.contextmanager
@@ -148,6 +151,7 @@ def packed(
     frames: Sequence[Frame],
     features: Mapping[str, dict[str, Any]],
     info: Mapping[str, Any],
+    task: str,
 ) -> Demonstration:
     """The frames of an episode by column, pictures encoded.
 
@@ -156,6 +160,7 @@ def packed(
         frames: One a control step.
         features: LeRobot's, in the order of the columns.
         info: Of the environment, at the end of the episode.
+        task: What was to be done, as a sentence.
     """
     columns: dict[str, npt.NDArray[Any] | list[bytes]] = {}
     pictures: dict[str, list[npt.NDArray[np.uint8]]] = {}
@@ -168,7 +173,13 @@ def packed(
     with _one_thread():
         shades = picture_shades(pictures)
     return Demonstration(
-        scenario, len(frames), columns, shades, bool(info["is_success"]), bool(info["collision"])
+        scenario=scenario,
+        length=len(frames),
+        columns=columns,
+        shades=shades,
+        task=task,
+        success=bool(info["is_success"]),
+        collision=bool(info["collision"]),
     )
 
 

@@ -67,6 +67,7 @@ class Expert:
             env.pending_setpoints,
             self._period_s,
         )
+        self._planner.avoid(env.obstacles)
         target = self._next_set_point(q, velocity, set_point)
         return np.asarray(env.commandable(target), dtype=np.float32)
 

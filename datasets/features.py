@@ -5,6 +5,7 @@ feature                                   dtype, shape    meaning
 ========================================  ==============  ========================================
 ``observation.images.eih``, ``.eth``      image (H,W,3)   as the policy saw it
 ``observation.state``                     float32 (14,)   measured positions (rad), then velocities
+``observation.<name>``                    float32 (k,)    what else the task's family shows
 ``action``                                float32 (7,)    what the demonstrator would do here
 ``next.reward``                           float32 (1,)    reward of the control step that followed
 ``next.done``, ``next.success``           bool (1,)       whether that step ended, or reached it
@@ -26,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.errors import OptionError
-from hvs_suite.tasks.shared.spec import Spec, observation_names
+from hvs_suite.tasks.shared.spec import Spec
 
 ROBOT_TYPE = "kuka_lbr_iiwa"
 # Spelled out rather than imported: robot.py loads MuJoCo, and reading a dataset must not.
@@ -50,6 +51,11 @@ def image_key(camera: str) -> str:
     return f"observation.images.{camera}"
 
 
+def vector_key(name: str) -> str:
+    """Feature of a vector that a family shows beside cameras and joints."""
+    return f"observation.{name}"
+
+
 def dataset_features(spec: Spec) -> dict[str, dict[str, Any]]:
     """The features of a dataset of this task, in LeRobot's form.
 
@@ -57,9 +63,10 @@ def dataset_features(spec: Spec) -> dict[str, dict[str, Any]]:
         OptionError: The task observes what a LeRobot dataset cannot hold, or takes other actions
             than the expert's.
     """
-    names = observation_names(spec.observations)
+    names = spec.observed
     channels = {"eih": spec.eih_channels, "eth": spec.eth_channels}
-    unfit = [name for name in names if name not in (*CAMERAS, *_STATE_SUFFIX)]
+    further = spec.further_observations
+    unfit = [name for name in names if name not in (*CAMERAS, *_STATE_SUFFIX, *further)]
     unfit += [f"{name}_channels=1" for name in names if channels.get(name, 3) != 3]
     unfit += ["normalise_observation=True"] if spec.normalise_observation else []
     unfit += [] if spec.action_mode == "joint_position" else [f"{spec.action_mode} actions"]
@@ -81,6 +88,9 @@ def dataset_features(spec: Spec) -> dict[str, dict[str, Any]]:
     state = [f"{joint}.{_STATE_SUFFIX[n]}" for n in _state_names(spec) for joint in JOINT_NAMES]
     if state:
         features[STATE] = _vector(state)
+    for name in names:
+        if name in further:
+            features[vector_key(name)] = _vector(list(further[name].dimensions))
     features[ACTION] = _vector([f"{joint}.pos" for joint in JOINT_NAMES])
     features["next.reward"] = _scalar("float32", "reward")
     features["next.done"] = _scalar("bool", "done")
@@ -107,6 +117,9 @@ def observed_part(
     names = _state_names(spec)
     if names:
         frame[STATE] = np.concatenate([observation[name] for name in names]).astype(np.float32)
+    for name in spec.further_observations:
+        if name in spec.observed:
+            frame[vector_key(name)] = observation[name].astype(np.float32)
     truth, info = environment.privileged(), environment.info
     for name in spec.privileged:
         frame[f"{PRIVILEGED}{name}"] = truth[name].astype(np.float32)
@@ -143,7 +156,7 @@ def acted_part(
 
 def _state_names(spec: Spec) -> list[str]:
     """The joint observations of a task, positions first."""
-    names = observation_names(spec.observations)
+    names = spec.observed
     return [name for name in _STATE_SUFFIX if name in names]
 
 

@@ -46,7 +46,9 @@ def numbered(folder: str, number: int) -> str:
     return f"{folder}/chunk-{chunk:03d}/file-{file:03d}.parquet"
 
 
-def counters(length: int, episode: int, first: int, fps: int) -> dict[str, npt.NDArray[Any]]:
+def counters(
+    length: int, episode: int, first: int, fps: int, task: int
+) -> dict[str, npt.NDArray[Any]]:
     """The columns (n,) that LeRobot adds to those of the features.
 
     Args:
@@ -54,6 +56,7 @@ def counters(length: int, episode: int, first: int, fps: int) -> dict[str, npt.N
         episode: Its index.
         first: Index of its first frame in the dataset.
         fps: Frames a second.
+        task: Number of its sentence.
     """
     frames = np.arange(length)
     return {
@@ -61,7 +64,7 @@ def counters(length: int, episode: int, first: int, fps: int) -> dict[str, npt.N
         "frame_index": frames,
         "episode_index": np.full(length, episode),
         "index": first + frames,
-        "task_index": np.zeros(length, np.int64),
+        "task_index": np.full(length, task),
     }
 
 
@@ -181,8 +184,8 @@ def write_episodes(
     pq.write_table(pa.table(columns), path)
 
 
-def write_task(root: Path, task: str) -> None:
-    """Writes ``meta/tasks.parquet`` with one task; pandas takes its sentence for the index."""
+def write_tasks(root: Path, tasks: Sequence[str]) -> None:
+    """Writes ``meta/tasks.parquet``; pandas takes the sentences for the index."""
     described = [
         {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": raw, "metadata": None}
         for name, kind, raw in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
@@ -195,7 +198,8 @@ def write_task(root: Path, task: str) -> None:
         "attributes": {},
         "creator": {"library": "pyarrow", "version": pa.__version__},
     }
-    table = pa.table({"task_index": pa.array([0], pa.int64()), "task": [task]})
+    numbers = pa.array(range(len(tasks)), pa.int64())
+    table = pa.table({"task_index": numbers, "task": list(tasks)})
     pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(pandas)}), root / TASKS)
 
 
@@ -215,6 +219,7 @@ def write_info(
     robot: str,
     episodes: int,
     frames: int,
+    tasks: int,
 ) -> None:
     """Writes ``meta/info.json``."""
     content = {
@@ -223,7 +228,7 @@ def write_info(
         "features": with_counters(features),
         "total_episodes": episodes,
         "total_frames": frames,
-        "total_tasks": 1,
+        "total_tasks": tasks,
         "chunks_size": FILES_A_CHUNK,
         "data_files_size_in_mb": DATA_FILE_MB,
         "video_files_size_in_mb": _VIDEO_FILE_MB,

@@ -3,7 +3,8 @@
 The expert knows where the target is. A policy that learns from it does not, where the arm hides the
 target from both cameras, and the mean of all ways to all places that it might be at leads nowhere.
 So as long as no camera has seen the target, the demonstrator moves the arm out of the eye-to-hand
-camera's line of sight, to the same posture whatever it knows.
+camera's line of sight, to the same posture whatever it knows. Where an obstacle hides the target
+even then, the hand looks down all around the base.
 
 Where the eye-to-hand camera stands a little elsewhere than it should, it says only within some
 centimetres where the target is. Who goes there at once ends up beside it, too low for the eye in
@@ -36,9 +37,15 @@ FloatArray = npt.NDArray[np.float64]
 
 LOOK_OUT_RAD: FloatArray = np.array([1.75, 0.8, 0.0, -0.6, 0.0, 0.6, 0.0])
 """Where the arm goes to look (rad), chosen for the fewest steps (docs/experiments/look-out.md)."""
+LOOK_AROUND_RAD: FloatArray = np.array(
+    [[2.4, 0.26, 0.0, -1.44, 0.0, 1.44, 0.0], [-2.7, 0.26, 0.0, -1.44, 0.0, 1.44, 0.0]]
+)
+"""Where it goes from there, one after the other (rad): the flange looks down from a height of
+0.55 m, which clears all obstacles, and passes over the whole ring."""
 LOOK_DOWN_M = 0.15
 """How far above the goal the eye in the hand looks for the target (m): high enough to have it in
 view wherever the eye-to-hand camera may take it to be, and hardly a detour."""
+_THERE_RAD = 0.02
 
 
 class Demonstrator(Expert):
@@ -60,6 +67,7 @@ class Demonstrator(Expert):
         """Forget that the target was seen: a new episode begins."""
         self._target: FloatArray | None = None
         self._has_seen = False
+        self._n_looked = 0
         self._has_seen_closely = not self._looks_down
 
     def _next_set_point(
@@ -72,7 +80,7 @@ class Demonstrator(Expert):
         if not (self._has_seen and self._has_seen_closely):
             self._look()
         if not self._has_seen:
-            ahead = self._planner.towards_posture(q, velocity, LOOK_OUT_RAD)
+            ahead = self._planner.towards_posture(q, velocity, self._next_look(q))
             if ahead is not None:
                 return ahead
         return super()._next_set_point(q, velocity, set_point)
@@ -80,6 +88,13 @@ class Demonstrator(Expert):
     def _goal_in(self, ahead_s: float) -> Goal:
         goal = super()._goal_in(ahead_s)
         return goal if self._has_seen_closely else _raised(goal)
+
+    def _next_look(self, q: FloatArray) -> FloatArray:
+        """Where to look from next, (7,) rad: from where the arm has come, it has looked."""
+        looks = [LOOK_OUT_RAD, *LOOK_AROUND_RAD]
+        if self._n_looked < len(looks) - 1 and np.abs(q - looks[self._n_looked]).max() < _THERE_RAD:
+            self._n_looked += 1
+        return np.asarray(looks[self._n_looked])
 
     def _look(self) -> None:
         """Notice whether a camera has the target in view."""

@@ -9,7 +9,8 @@ A decision is:
 1. Rank the goal's whole redundant family (elbow swivel, mirror shapes, free yaw) by the least
    travel time from the present position and velocity under speed and acceleration limits.
 2. Take the first whose time-optimal motion (ruckig) keeps clear of surface and self.
-3. Answer with the point of that motion at the end of the control step, and a little further: the
+3. Where all are blocked by obstacles, head for a via point (see `hvs_suite.datasets.roadmap`).
+4. Answer with the point of that motion at the end of the control step, and a little further: the
    arm trails its set point.
 
 A goal that moves is met where it will be, and then followed (see `Planner.follow`).
@@ -24,6 +25,8 @@ import ruckig
 
 from hvs_suite.cell import robot
 from hvs_suite.cell.kinematics import Kinematics, away_from_stops, kinematics
+from hvs_suite.cell.solid import Solid, obstacle_distance
+from hvs_suite.datasets.roadmap import Roadmap
 from hvs_suite.tasks.shared.goal import Goal
 
 FloatArray = npt.NDArray[np.float64]
@@ -31,6 +34,8 @@ BoolArray = npt.NDArray[np.bool_]
 
 CLEARANCE_M = 0.010
 """Distance that a motion keeps from the surface and between links (m)."""
+OBSTACLE_CLEARANCE_M = 0.020
+"""Distance that a motion keeps from obstacles (m)."""
 ESCAPE_HEIGHT_M = 0.15
 """Where no way to the goal is clear, go above it first (m)."""
 N_SWIVEL = 360
@@ -54,6 +59,11 @@ PLAIN_SWIVELS = 1
 
 _FULL_SPEED: FloatArray = robot.JOINT_SPEED_RAD_S[:6, None]
 _MAX_PATHS = 24
+_MAX_PATHS_AMONG_OBSTACLES = 4
+"""Straight ways that are tried before the roadmap is asked."""
+_MAX_VIAS = 40
+_KEPT_ROADMAPS = 4
+"""Of an episode: over the goal and at it, before and after an obstacle moves."""
 _MAX_ESCAPES = 4
 _MAX_FLANGE_SPEED_M_S = 2.5
 _PATH_STEP_S = 0.02
@@ -141,6 +151,8 @@ class Planner:
         self._floor_m = 0.0
         self._clearance_m = 0.0
         """Of the present state."""
+        self._solids: tuple[Solid, ...] = ()
+        self._roadmaps: dict[tuple[tuple[Solid, ...], bytes], Roadmap] = {}
         self._soonest_s = math.inf
         """What the soonest way to the goal took a control step ago (s)."""
         self._ruckig = ruckig.Ruckig(7)
@@ -149,6 +161,10 @@ class Planner:
         self._input.max_acceleration = list(robot.JOINT_ACCELERATION_RAD_S2)
         # No jerk limit: within a control step the cell's set point moves at constant speed, so a
         # ramp that is shorter than the step cannot be executed, and a longer one costs time.
+
+    def avoid(self, solids: tuple[Solid, ...]) -> None:
+        """Keep out of solids from now on, beside the surface; none at first."""
+        self._solids = solids
 
     def next_set_point(
         self, q: FloatArray, velocity: FloatArray, goal: Goal, *, onward: Goal | None = None
@@ -175,7 +191,11 @@ class Planner:
             return q
         required = min(CLEARANCE_M, self._clearance_m - 1e-3)
         candidates = self._in_order(q, velocity, family)
-        motion = self._first_clear(q, velocity, candidates, required)
+        most = _MAX_PATHS_AMONG_OBSTACLES if self._solids else _MAX_PATHS
+        motion = self._first_clear(q, velocity, candidates, required, most)
+        if motion is None and self._solids:
+            vias = self._vias(q, velocity, goal)
+            motion = self._first_clear(q, velocity, vias, required, _MAX_VIAS)
         if motion is None:
             motion = self._escape(q, velocity, goal, required)
         return self._point_ahead(motion)
@@ -194,7 +214,7 @@ class Planner:
             (7,) rad, or None where the way there is not clear.
         """
         self._floor_m = 0.0
-        self._clearance_m = self._kinematics.clearance(q, self._floor_m)
+        self._clearance_m = self._clearance(q)
         motion = self._motion(q, velocity, posture, together=False)
         if self._least_clearance(motion, CLEARANCE_M) < CLEARANCE_M:
             return None
@@ -282,7 +302,31 @@ class Planner:
         # target's height, which is right near the goal and a guess far from it.
         height = float(goal.target[2])
         self._floor_m = height if goal.normal[2] > _LEVEL else height - CLEARANCE_M
-        self._clearance_m = self._kinematics.clearance(q, self._floor_m)
+        self._clearance_m = self._clearance(q)
+
+    def _clearance(self, q: FloatArray) -> float:
+        """Distance (m) of the arm from the surface, itself and obstacles, these a little nearer."""
+        clearance = self._kinematics.clearance(q, self._floor_m)
+        if not self._solids:
+            return clearance
+        # So that one bound holds for all.
+        nearer = OBSTACLE_CLEARANCE_M - CLEARANCE_M
+        return min(clearance, obstacle_distance(self._solids)(q) - nearer)
+
+    def _vias(self, q: FloatArray, velocity: FloatArray, goal: Goal) -> Iterator[FloatArray]:
+        """Postures (7,) to head for where the goal's own cannot be reached straight."""
+        key = self._solids, goal.position.tobytes() + goal.normal.tobytes()
+        if key not in self._roadmaps:
+            while len(self._roadmaps) >= _KEPT_ROADMAPS:
+                del self._roadmaps[next(iter(self._roadmaps))]
+            self._roadmaps[key] = Roadmap(self._clearance, goal)
+        roadmap = self._roadmaps[key]
+        nodes = roadmap.nodes[:, :6].T
+        times, effort = _stopping_travel_time(q[:6], velocity[:6], nodes)
+        rest = _where_braking_ends(q, velocity)[6]
+        last = min(max(rest, -robot.JOINT_RANGE_RAD[6]), robot.JOINT_RANGE_RAD[6])
+        for node in roadmap.candidates(times + TIE_BREAK_S * effort):
+            yield np.append(node[:6], last)
 
     def _remember_goal(self, goal: Goal, among: BoolArray | None = None) -> None:
         """Computes the goal's family of configurations once a goal.
@@ -368,6 +412,7 @@ class Planner:
         velocity: FloatArray,
         candidates: Iterable[FloatArray],
         required: float,
+        most: int,
     ) -> ruckig.Trajectory | None:
         """The motion to the first candidate that keeps clear; skips what is near a blocked one."""
         blocked: list[FloatArray] = []
@@ -378,7 +423,7 @@ class Planner:
             if self._least_clearance(motion, required) >= required:
                 return motion
             blocked.append(goal)
-            if len(blocked) >= _MAX_PATHS:
+            if len(blocked) >= most:
                 break
         return None
 
@@ -482,7 +527,7 @@ class Planner:
         while least >= required and t < motion.duration:
             t += max(_PATH_STEP_S, (clearance - CLEARANCE_M) / _MAX_FLANGE_SPEED_M_S)
             q = motion.at_time(min(t, motion.duration))[0]
-            clearance = self._kinematics.clearance(q, self._floor_m)
+            clearance = self._clearance(q)
             least = min(least, clearance)
         return least
 

@@ -155,7 +155,7 @@ def read_sentences(root: Path) -> list[str]:
     with in_file(root, TASKS):
         table = read_table(root, TASKS, ["task_index", "task"])
         if table.num_rows > _MOST_SENTENCES:
-            raise DatasetError(f"lists {table.num_rows:,} tasks; a recording has one")
+            raise DatasetError(f"lists {table.num_rows:,} tasks; a recording has a few")
         order = np.argsort(_numbers(table, ["task_index"])["task_index"])
         sentences = [str(table["task"][int(row)].as_py()) for row in order]
         if any(len(sentence) > _LONGEST_SENTENCE for sentence in sentences):

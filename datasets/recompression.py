@@ -6,7 +6,7 @@ original in nothing but what the codec did.
 
 import dataclasses
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -82,17 +82,20 @@ class VideoCopy:
         info = reader.read_info(self.data)
         counters = lerobot_files.with_counters({})
         features = {k: v for k, v in info["features"].items() if k not in counters}
-        [sentence] = reader.read_sentences(self.data)
-        writer = DatasetWriter(out, features, info["fps"], sentence, EPISODES_A_BLOCK)
+        sentences = reader.read_sentences(self.data)
+        writer = DatasetWriter(out, features, info["fps"], EPISODES_A_BLOCK)
         for _, table, pictures in self.episodes():
-            writer.save(_demonstration(features, table, pictures))
+            writer.save(_demonstration(features, table, pictures, sentences))
             if on_episode is not None:
                 on_episode()
         writer.publish()
 
 
 def _demonstration(
-    features: dict[str, Any], table: pa.Table, pictures: dict[str, list[Picture]]
+    features: dict[str, Any],
+    table: pa.Table,
+    pictures: dict[str, list[Picture]],
+    sentences: Sequence[str],
 ) -> Demonstration:
     """An episode's own numbers with other pictures."""
     numbers = {
@@ -106,6 +109,7 @@ def _demonstration(
         length=table.num_rows,
         columns={**numbers, **images},
         shades=picture_shades(pictures),
+        task=sentences[int(reader.column(table, "task_index")[0])],
         success=bool(numbers["next.success"].any()),
         collision=False,
     )

@@ -119,7 +119,7 @@ def record(
     with taken(root, resume=resume), _removed_if_empty(missing):
         outcomes = published_outcomes(root)
         tracker = _Tracker(len(outcomes), sum(outcomes), episodes, progress)
-        writer = DatasetWriter(root, features, spec.fps, spec.instruction(), block)
+        writer = DatasetWriter(root, features, spec.fps, block)
         played = play(
             MakeEnvironment(task, split, metadata.options),
             make_demonstrator,

@@ -23,6 +23,7 @@ from hvs_suite.datasets.features import (
     acted_part,
     image_key,
     observed_part,
+    vector_key,
 )
 
 if TYPE_CHECKING:
@@ -103,7 +104,9 @@ def resimulate(
             time_step.last(),
             env.info["is_success"],
         )
-        for name in (STATE, ERRORS, *(f"{PRIVILEGED}{n}" for n in spec.privileged), *OUTCOMES):
+        vectors = (STATE, *map(vector_key, spec.further_observations))
+        truths = (f"{PRIVILEGED}{name}" for name in spec.privileged)
+        for name in (*vectors, ERRORS, *truths, *OUTCOMES):
             if name in columns and name in seen and name not in found:
                 _compare(found, frame, name, columns[name][frame], seen[name], features)
     return sorted(found.values(), key=lambda each: (each.frame, each.column))

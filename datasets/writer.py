@@ -54,6 +54,7 @@ class _Published:
         data_files: Number of the next data file.
         episode_files: Number of the next file of ``meta/episodes``.
         stats: Statistics of it all; empty where there is nothing.
+        tasks: Sentences that say what was to be done, the first one first.
     """
 
     episodes: int = 0
@@ -61,6 +62,7 @@ class _Published:
     data_files: int = 0
     episode_files: int = 0
     stats: Mapping[str, FeatureStats] = dataclasses.field(default_factory=dict)
+    tasks: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -72,12 +74,14 @@ class _Episode:
         length: Its frames.
         numbers: Its columns of numbers, with those that LeRobot adds.
         shades: Pixels of its pictures, counted.
+        task: What was to be done, as a sentence.
     """
 
     first: int
     length: int
     numbers: Mapping[str, npt.NDArray[Any]]
     shades: Mapping[str, Shades]
+    task: str
 
 
 class DatasetWriter:
@@ -87,7 +91,6 @@ class DatasetWriter:
         root: The dataset; may be missing or empty, or hold published blocks.
         features: LeRobot's features.
         fps: Frames a second.
-        task: The task as a sentence.
         block: Episodes a block.
     """
 
@@ -96,7 +99,6 @@ class DatasetWriter:
         root: Path,
         features: Mapping[str, dict[str, Any]],
         fps: int,
-        task: str,
         block: int,
     ) -> None:
         self._root = root
@@ -104,7 +106,6 @@ class DatasetWriter:
         self._features = dict(features)
         self._schema = files.data_schema(features)
         self._fps = fps
-        self._task = task
         self._block = block
         self._published: _Published | None = None
         self._open: _Block | None = None
@@ -121,12 +122,13 @@ class DatasetWriter:
             self._published = _read_published(self._root, self._features)
         if self._open is None:
             shutil.rmtree(self._stage, ignore_errors=True)
-            self._open = _Block(self._published.data_files)
+            self._open = _Block(self._published.data_files, self._published.tasks)
         block, before = self._open, self._published
         length, first = demonstration.length, before.frames + block.frames
-        counters = files.counters(length, before.episodes + block.size, first, self._fps)
+        task = block.number_of(demonstration.task)
+        counters = files.counters(length, before.episodes + block.size, first, self._fps, task)
         numbers = {**demonstration.numbers, **counters}
-        episode = _Episode(first, length, numbers, demonstration.shades)
+        episode = _Episode(first, length, numbers, demonstration.shades, demonstration.task)
         block.waiting.append((episode, {**demonstration.columns, **counters}))
         block.waiting_bytes += demonstration.picture_bytes
         if block.size >= self._block:
@@ -151,7 +153,7 @@ class DatasetWriter:
                 episode.length,
                 episode.first,
                 data_file,
-                self._task,
+                episode.task,
             )
             for i, (episode, data_file) in enumerate(
                 zip(block.episodes, block.data_files, strict=True)
@@ -163,12 +165,19 @@ class DatasetWriter:
             block.data_file + 1,
             before.episode_files + 1,
             {name: merge_stats([part[name] for part in parts]) for name in names},
+            tuple(block.tasks),
         )
         files.write_episodes(self._stage, before.episode_files, rows, self._features, stats)
-        files.write_task(self._stage, self._task)
+        files.write_tasks(self._stage, after.tasks)
         files.write_stats(self._stage, self._features, after.stats)
         files.write_info(
-            self._stage, self._features, self._fps, ROBOT_TYPE, after.episodes, after.frames
+            self._stage,
+            self._features,
+            self._fps,
+            ROBOT_TYPE,
+            episodes=after.episodes,
+            frames=after.frames,
+            tasks=len(after.tasks),
         )
         for part in (files.DATA, files.EPISODES):
             for staged in sorted((self._stage / part).glob("*/*.parquet")):
@@ -195,8 +204,10 @@ class _Block:
 
     Args:
         data_file: Number of its first data file.
+        tasks: Sentences that are known.
 
     Attributes:
+        tasks: Those and new ones.
         waiting: Episodes that are not written yet, each with its columns.
         waiting_bytes: Size of their pictures.
         episodes: Those that are.
@@ -204,8 +215,9 @@ class _Block:
         torn: Rows were written that are not listed.
     """
 
-    def __init__(self, data_file: int) -> None:
+    def __init__(self, data_file: int, tasks: Sequence[str]) -> None:
         self.data_file = data_file
+        self.tasks = list(tasks)
         self.waiting: list[tuple[_Episode, files.Columns]] = []
         self.waiting_bytes = 0
         self.episodes: list[_Episode] = []
@@ -224,6 +236,12 @@ class _Block:
     def frames(self) -> int:
         """Their frames."""
         return sum(e.length for e in (*self.episodes, *(e for e, _ in self.waiting)))
+
+    def number_of(self, task: str) -> int:
+        """The number of a sentence, which a new one gets here."""
+        if task not in self.tasks:
+            self.tasks.append(task)
+        return self.tasks.index(task)
 
     def write(self, stage: Path, schema: pa.Schema) -> None:
         """Writes the episodes that wait."""
@@ -312,7 +330,8 @@ def _read_published(root: Path, features: Mapping[str, dict[str, Any]]) -> _Publ
             raise
         what = f"is damaged ({type(error).__name__}: {error}); record the dataset again"
         raise reader.DamagedFileError(files.STATS, what) from None
-    return _Published(episodes, frames, data_file + 1, episode_file + 1, whole)
+    tasks = tuple(reader.read_sentences(root))
+    return _Published(episodes, frames, data_file + 1, episode_file + 1, whole, tasks)
 
 
 def _stats_of_episodes(root: Path, listed: list[str], names: list[str]) -> dict[str, FeatureStats]:

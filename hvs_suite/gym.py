@@ -75,7 +75,6 @@ class TaskEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
         spec = self._environment.spec
         self.metadata = {**self.metadata, "render_fps": spec.fps}
         self.task = spec.name
-        self.task_description = spec.instruction()
         specification = self._environment.observation_spec()
         self._spaces: dict[str, spaces.Space[Any]] = {
             name: _space(spec) for name, spec in specification.items()
@@ -86,6 +85,11 @@ class TaskEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
         self._max_episode_steps: int = spec.time_limit_steps
         self._playing = False
         self._frame: npt.NDArray[np.uint8] | None = None
+
+    @property
+    def task_description(self) -> str:
+        """The task of the present episode as one sentence."""
+        return self._environment.instruction
 
     @property
     def environment(self) -> Any:
@@ -182,7 +186,8 @@ class PixelsAgentPos(gymnasium.Wrapper[Any, Any, Observation, Any]):
     """The same environment with the observations that LeRobot's environments have.
 
     ``pixels`` holds the camera images by name, uint8 (H, W, 3); ``agent_pos`` the measured joint
-    positions (rad), then velocities (rad/s), float32 (14,).
+    positions (rad), then velocities (rad/s), float32 (14,); what else the task's family shows
+    keeps its name.
 
     Args:
         env: An :class:`TaskEnv`.
@@ -213,6 +218,10 @@ class PixelsAgentPos(gymnasium.Wrapper[Any, Any, Observation, Any]):
                 np.concatenate([box.high for box in boxes]),
                 dtype=np.float32,
             )
+        self._further = tuple(
+            n for n in env.environment.spec.further_observations if n in inner.spaces
+        )
+        view |= {name: inner[name] for name in self._further}
         self.observation_space = spaces.Dict(view)
 
     def reset(
@@ -231,6 +240,7 @@ class PixelsAgentPos(gymnasium.Wrapper[Any, Any, Observation, Any]):
         view: dict[str, Any] = {"pixels": {name: observation[name] for name in self._cameras}}
         if self._vectors:
             view["agent_pos"] = np.concatenate([observation[name] for name in self._vectors])
+        view |= {name: observation[name] for name in self._further}
         return view
 
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from hvs_suite.errors import OutputError
 from hvs_suite.files import replacing
-from hvs_suite.rollout import run_episode
+from hvs_suite.rollout import Instructed, run_episode
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -133,6 +133,10 @@ class _Filming:
         self._env = env
         self._policy = policy
         self._reward_sum = 0.0
+
+    def instruct(self, sentence: str) -> None:
+        if isinstance(self._policy, Instructed):
+            self._policy.instruct(sentence)
 
     def reset(self) -> None:
         self.frames = []

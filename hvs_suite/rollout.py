@@ -19,7 +19,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from multiprocessing.reduction import ForkingPickler
-from typing import Any, Protocol, cast
+from typing import Any, Protocol, cast, runtime_checkable
 
 import dm_env
 import numpy as np
@@ -46,6 +46,20 @@ class Policy(Protocol):
 
     def select_action(self, observation: Observation) -> Action:
         """Returns the next action, (7,) float32 in [-1, 1], for one unbatched observation."""
+
+
+@runtime_checkable
+class Instructed(Protocol):
+    """A policy that is told what to do in each episode, before its `reset`."""
+
+    def instruct(self, sentence: str) -> None:
+        """Takes in the task of the coming episode as a sentence."""
+
+
+def tell(policy: Any, env: Any) -> None:
+    """Tells a policy the task of the environment's episode, if it listens."""
+    if isinstance(policy, Instructed):
+        policy.instruct(env.instruction)
 
 
 class Environment(Protocol):
@@ -131,6 +145,7 @@ def run_episode(
     """
     spec = env.action_spec()
     time_step = env.reset(scenario=scenario)
+    tell(policy, env)
     policy.reset()
     actions: list[Action] = []
     n_clipped = 0

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from hvs_suite import registry, rollout
 from hvs_suite.errors import OptionError, describe
 from hvs_suite.eval.scoring.result_file import EpisodeRow, Settled
-from hvs_suite.rollout import Action, Observation, Policy, library_seeds
+from hvs_suite.rollout import Action, Instructed, Observation, Policy, library_seeds
 
 NOT_FINITE = "not finite"
 WRONG_SHAPE = "wrong shape"
@@ -49,6 +49,10 @@ class Stage(Protocol):
     @property
     def info(self) -> Mapping[str, Any]:
         """Outcome and errors (mm, deg) at the end of the last control step."""
+
+    @property
+    def instruction(self) -> str:
+        """The task of the present episode as a sentence."""
 
     @property
     def landing_mm(self) -> npt.NDArray[np.float64]:
@@ -277,6 +281,8 @@ def _play_policy(env: Stage, policy: Policy, scenario: int, seed: int, limit_s: 
 
     def start() -> None:
         seeds.enter_context(library_seeds(seed))
+        if isinstance(policy, Instructed):
+            guarded(lambda: policy.instruct(env.instruction))
         guarded(policy.reset)
 
     with contextlib.ExitStack() as seeds, _alarm_clock() as set_alarm:

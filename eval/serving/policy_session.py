@@ -22,7 +22,7 @@ from hvs_suite.eval.scoring.contender import Contender
 from hvs_suite.eval.serving import wire
 from hvs_suite.policies.context import PolicyContext
 from hvs_suite.registry import find
-from hvs_suite.rollout import Policy, library_seeds, one_torch_thread
+from hvs_suite.rollout import Instructed, Policy, library_seeds, one_torch_thread
 from hvs_suite.tasks.shared import lock
 
 # Well below what an answer may hold, and more than anybody reads.
@@ -86,6 +86,11 @@ class Session:
             raise wire.WireError("a reset has a seed from 0 to 2^32 - 1")
         self._seeds.close()
         self._seeds.enter_context(library_seeds(seed))
+        sentence = message.get("instruction")
+        if isinstance(policy, Instructed) and isinstance(sentence, str):
+            told = _guarded(lambda: policy.instruct(sentence), lambda _: {"type": "done"})
+            if told["type"] != "done":
+                return told
         return _guarded(policy.reset, lambda _: {"type": "done"})
 
     def _observe(self, policy: Policy, message: wire.Message) -> wire.Message:

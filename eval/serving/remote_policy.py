@@ -115,6 +115,7 @@ class RemotePolicy(Connected):
         self._limit_s = decision_limit_s
         self._line: Line | None = None
         self._seed = 0
+        self._sentence = str(hello["instruction"])
         self.welcome: Welcome | None = None
 
     @abc.abstractmethod
@@ -169,13 +170,18 @@ class RemotePolicy(Connected):
             where = ".".join(map(str, first["loc"]))
             raise self._refusal(f"its welcome makes no sense ({where}: {first['msg']})") from error
 
+    def instruct(self, sentence: str) -> None:
+        """Takes in the task of the coming episode as a sentence, to be passed on."""
+        self._sentence = sentence
+
     def reset(self) -> None:
         """Forgets the last episode.
 
         Raises:
             EpisodeLostError: The other end did not do so.
         """
-        self._ask({"type": "reset", "seed": self._seed}, "done")
+        message = {"type": "reset", "seed": self._seed, "instruction": self._sentence}
+        self._ask(message, "done")
 
     def select_action(self, observation: Observation) -> Action:
         """Asks the other end.

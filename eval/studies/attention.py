@@ -12,7 +12,14 @@ from hvs_suite.pictures import GREEN, Picture, as_rgb, resize, strip
 from hvs_suite.policies.checkpoints.files import read_config
 from hvs_suite.policies.checkpoints.loading import load_network
 from hvs_suite.policies.hvs.network import HvsNetwork, Sighting
-from hvs_suite.rollout import Action, Observation, Policy, one_torch_thread, run_episode
+from hvs_suite.rollout import (
+    Action,
+    Instructed,
+    Observation,
+    Policy,
+    one_torch_thread,
+    run_episode,
+)
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -71,6 +78,10 @@ class _Seen:
         self._policy = policy
         self.observations: list[Observation] = []
         self.truths: list[dict[str, npt.NDArray[Any]]] = []
+
+    def instruct(self, sentence: str) -> None:
+        if isinstance(self._policy, Instructed):
+            self._policy.instruct(sentence)
 
     def reset(self) -> None:
         self._policy.reset()

@@ -96,6 +96,10 @@ class Cell(composer.Arena):
         self.markers.append(marker)
         self.attach(marker).mocap = True
 
+    def add_prop(self, prop: composer.Entity) -> None:
+        """Adds a thing that scenes put somewhere, a mocap body too."""
+        self.attach(prop).mocap = True
+
     @property
     def mjcf_model(self) -> mjcf.RootElement:
         """Root of the cell's MJCF tree."""

@@ -8,12 +8,12 @@ import gymnasium
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
-from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE, OBS_STR
 
 from hvs_suite.errors import OptionError
 from hvs_suite.gym import make_pixels_agent_pos
 from hvs_suite.registry import find
-from hvs_suite.tasks.shared.spec import Spec, observation_names
+from hvs_suite.tasks.shared.spec import Spec
 
 _STATE_NAMES = ("joint_positions", "joint_velocities")
 _CAMERA_NAMES = ("eih", "eth")
@@ -103,8 +103,10 @@ def _features(spec: Spec) -> dict[str, PolicyFeature]:
     Raises:
         OptionError: The task observes what LeRobot's policies cannot take.
     """
-    names = observation_names(spec.observations)
-    foreign = [name for name in names if name not in _CAMERA_NAMES + _STATE_NAMES]
+    names = spec.observed
+    further = spec.further_observations
+    known = (*_CAMERA_NAMES, *_STATE_NAMES, *further)
+    foreign = [name for name in names if name not in known]
     channels = {"eih": spec.eih_channels, "eth": spec.eth_channels}
     grey = [name for name in names if channels.get(name, 3) != 3]
     if foreign or grey or spec.normalise_observation:
@@ -121,6 +123,10 @@ def _features(spec: Spec) -> dict[str, PolicyFeature]:
     joints = _JOINTS * sum(name in _STATE_NAMES for name in names)
     if joints:
         features[OBS_STATE] = PolicyFeature(FeatureType.STATE, (joints,))
+    for name in names:
+        if name in further:
+            shape = (len(further[name].dimensions),)
+            features[f"{OBS_STR}.{name}"] = PolicyFeature(FeatureType.STATE, shape)
     size = 6 if spec.action_mode == "flange_twist" else _JOINTS
     features[ACTION] = PolicyFeature(FeatureType.ACTION, (size,))
     return features

@@ -41,10 +41,15 @@ from hvs_suite.policies.hvs.network import (
 )
 from hvs_suite.policies.trained_for import check_trained_for
 from hvs_suite.rollout import Observation, one_torch_thread
-from hvs_suite.tasks.shared.spec import Spec, observation_names
+from hvs_suite.tasks.shared.spec import Spec
 
 Action = npt.NDArray[np.float32]
-Decide = Callable[[dict[str, Tensor]], Tensor]
+Batch = dict[str, Any]
+"""Tensors under LeRobot's names, and the task as a sentence."""
+Decide = Callable[[Batch], Tensor]
+
+VECTOR_PREFIX = "observation."
+TASK = "task"
 
 # Where the network's own keys live in a checkpoint of the LeRobot policy around it.
 NETWORK_PREFIX = "network."
@@ -105,7 +110,12 @@ class CheckpointPolicy:
             if config.get("type") == "hvs" and _processors_are_standard(folder):
                 self._decide, self._forget = _network(folder, config)
             else:
-                self._decide, self._forget = _lerobot(folder, spec.instruction())
+                self._decide, self._forget = _lerobot(folder)
+        self._sentence = spec.instruction()
+
+    def instruct(self, sentence: str) -> None:
+        """Take in the task of the coming episode as a sentence."""
+        self._sentence = sentence
 
     def reset(self) -> None:
         """Forget the last episode."""
@@ -122,7 +132,7 @@ class CheckpointPolicy:
             (7,) float32.
         """
         with one_torch_thread(), torch.inference_mode():
-            action = self._decide(as_batch(observation, self._inputs))
+            action = self._decide({**as_batch(observation, self._inputs), TASK: self._sentence})
         return np.array(action.reshape(-1).cpu().numpy(), np.float32)
 
 
@@ -131,7 +141,8 @@ def as_batch(observation: Observation, keys: Iterable[str]) -> dict[str, Tensor]
 
     Args:
         observation: As in `CheckpointPolicy.select_action`.
-        keys: What is read of it: ``observation.images.<camera>`` and ``observation.state``.
+        keys: What is read of it: ``observation.images.<camera>``, ``observation.state`` and
+            ``observation.<name>``, what else a family shows.
 
     Returns:
         Images (C, H, W) in [0, 1] and the state (14,) or (7,), float32, no batch dimension.
@@ -145,6 +156,9 @@ def as_batch(observation: Observation, keys: Iterable[str]) -> dict[str, Tensor]
             parts = ["joint_positions", "joint_velocities"]
             joints = [observation[name] for name in parts if name in observation]
             batch[key] = torch.from_numpy(np.concatenate(joints).astype(np.float32))
+        else:
+            vector = observation[key.removeprefix(VECTOR_PREFIX)]
+            batch[key] = torch.from_numpy(vector.astype(np.float32))
     return batch
 
 
@@ -187,7 +201,7 @@ def check_fit(config: Mapping[str, Any], folder: Path, spec: Spec) -> None:
     """
     if config.get("type") == "hvs":
         check_trained_for(config, folder, spec)
-    shown = observation_names(spec.observations)
+    shown = spec.observed
     mismatch = f"{folder} does not fit {spec.name}: "
     if spec.action_mode != "joint_position" or spec.normalise_observation:
         raise PolicyError(
@@ -204,6 +218,10 @@ def check_fit(config: Mapping[str, Any], folder: Path, spec: Spec) -> None:
                 raise PolicyError(
                     mismatch + f"it reads {shape[0]} joint numbers, the task shows {available}"
                 )
+        elif (vector := key.removeprefix(VECTOR_PREFIX)) in spec.further_observations:
+            size = len(spec.further_observations[vector].dimensions)
+            if vector not in shown or shape != (size,):
+                raise PolicyError(mismatch + f"it reads {key}, which the task shows otherwise")
         elif name == key or name not in shown or name not in ("eih", "eth"):
             raise PolicyError(mismatch + f"it reads {key}, which the task does not show")
         else:
@@ -313,7 +331,7 @@ def _nothing() -> None:
     """Forget nothing: a policy without joints has no memory."""
 
 
-def _lerobot(folder: Path, instruction: str) -> tuple[Decide, Callable[[], None]]:
+def _lerobot(folder: Path) -> tuple[Decide, Callable[[], None]]:
     """Load any LeRobot policy with its processors, on the CPU."""
     try:
         from lerobot.configs import PreTrainedConfig
@@ -342,8 +360,8 @@ def _lerobot(folder: Path, instruction: str) -> tuple[Decide, Callable[[], None]
     except Exception as error:  # LeRobot and what it loads raise anything
         raise PolicyError(f"LeRobot cannot load {folder}: {first_line(error)}") from error
 
-    def decide(batch: dict[str, Tensor]) -> Tensor:
-        action: Tensor = after(policy.select_action(before({**batch, "task": instruction})))
+    def decide(batch: Batch) -> Tensor:
+        action: Tensor = after(policy.select_action(before(batch)))
         return action
 
     return decide, policy.reset

@@ -26,7 +26,7 @@ from hvs_suite.policies.hvs.dataset import Manifest
 from hvs_suite.policies.hvs.network import IMAGE_PREFIX
 from hvs_suite.policies.imitation.demonstrations import Recording
 from hvs_suite.policies.imitation.frame_cache import new_frames, open_frames
-from hvs_suite.rollout import Policy, play
+from hvs_suite.rollout import Policy, play, tell
 
 if TYPE_CHECKING:
     from hvs_suite.tasks.shared.environment import Environment
@@ -101,6 +101,7 @@ def _played(
     env: "Environment", policy: Policy, scenario: int, label: Callable[[], Frame]
 ) -> PlayedEpisode:
     time_step = env.reset(scenario=scenario)
+    tell(policy, env)
     policy.reset()
     frames: list[Frame] = []
     while not time_step.last():

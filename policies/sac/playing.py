@@ -28,7 +28,7 @@ from hvs_suite.policies.checkpoints.files import (
 )
 from hvs_suite.policies.trained_for import TrainedFor, check_trained_for, trained_for
 from hvs_suite.rollout import Observation, one_torch_thread
-from hvs_suite.tasks.shared.spec import Spec, observation_names
+from hvs_suite.tasks.shared.spec import Spec
 
 if TYPE_CHECKING:
     from stable_baselines3.sac.policies import Actor
@@ -236,7 +236,7 @@ def check_fit(config: Config, folder: Path, spec: Spec) -> None:
         PolicyError: It does not fit.
     """
     check_trained_for(config.model_dump(), folder, spec)
-    shown = observation_names(spec.observations)
+    shown = spec.observed
     mismatch = f"{folder} does not fit {spec.name}: "
     if spec.normalise_observation or spec.action_mode != config.action_mode:
         raise PolicyError(mismatch + f"it reads raw observations and commands {config.action_mode}")

@@ -31,7 +31,6 @@ from hvs_suite.tasks.shared.spec import (
     PRESETS,
     THESIS_REWARDS,
     Spec,
-    observation_names,
 )
 
 PACKAGES = ("hvs-suite", "mujoco", "numpy", "stable-baselines3", "torch")
@@ -153,7 +152,7 @@ def _make_model(journal: Journal, settings: Settings, seed: int, device: str) ->
 
 
 def _check(spec: Spec, device: str) -> None:
-    others = [name for name in observation_names(spec.observations) if name not in INPUTS]
+    others = [name for name in spec.observed if name not in INPUTS]
     if others or spec.normalise_observation:
         raise OptionError(
             f"the network reads {', '.join(INPUTS)}, and normalises them itself; leave out "

@@ -24,6 +24,7 @@ def make_servo(env: Playground) -> Policy:
     Raises:
         PolicyError: The task needs what this method does not do.
     """
+    from hvs_suite.policies.servo.among_others import AmongOthersServo
     from hvs_suite.policies.servo.changing_target import ChangingTargetServo
     from hvs_suite.policies.servo.moving_target import MovingTargetServo
     from hvs_suite.policies.servo.still_target import StillTargetServo
@@ -32,6 +33,7 @@ def make_servo(env: Playground) -> Policy:
         "align": StillTargetServo,
         "sequence": ChangingTargetServo,
         "track": MovingTargetServo,
+        "clutter": AmongOthersServo,
     }
     spec = env.spec
     if spec.family not in servos:

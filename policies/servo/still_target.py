@@ -44,7 +44,6 @@ from hvs_suite.rollout import Observation
 from hvs_suite.tasks.shared.detection import find_discs
 from hvs_suite.tasks.shared.goal import Goal
 from hvs_suite.tasks.shared.placing import PlacingSpec
-from hvs_suite.tasks.shared.spec import observation_names
 
 if TYPE_CHECKING:
     pass
@@ -52,7 +51,6 @@ if TYPE_CHECKING:
 FloatArray = npt.NDArray[np.float64]
 
 _UP = np.array([0.0, 0.0, 1.0])
-_LOOK_HEIGHT_M = 0.30
 _MAX_HOVER_M = 0.40
 _VIEW_SHARE = 0.9
 """Share of the eye-in-hand camera's half view that the target has to lie within."""
@@ -69,6 +67,7 @@ class StillTargetServo:
 
     Attributes:
         max_misses: How often the eye in the hand may miss a target that it should see.
+        look_height_m: How high the flange hovers while it looks for a target (m).
 
     Args:
         spec: The task's parameters.
@@ -78,6 +77,7 @@ class StillTargetServo:
     """
 
     max_misses = 6
+    look_height_m = 0.30
 
     def __init__(self, spec: PlacingSpec) -> None:
         _check(spec)
@@ -87,7 +87,7 @@ class StillTargetServo:
         self._planner = Planner(spec.control_period_s)
         self._sight = Sight(spec.target_diameter_m, spec.ring_m)
         self._search = TargetSearch(self._kinematics, spec.ring_m, spec.target_diameter_m)
-        names = observation_names(spec.observations)
+        names = spec.observed
         self._has_eih, self._has_eth = "eih" in names, "eth" in names
         self._eih_K = intrinsics(spec.eih_resolution, spec.eih_fov_deg)
         self._eth_K = intrinsics(spec.eth_resolution, spec.eth_fov_deg)
@@ -231,14 +231,14 @@ class StillTargetServo:
         until there is nothing left to see from it.
         """
         hidden = self._search.possible
-        radius = self._half_view * _LOOK_HEIGHT_M
+        radius = self._half_view * self.look_height_m
         if self._look is not None and _near(hidden, self._look, radius).any():
             return self._look
         best, self._look = -1.0, None
         choices = hidden[np.unique(np.linspace(0, len(hidden) - 1, _LOOK_CHOICES).astype(int))]
         for choice in choices:
             covered = hidden[_near(hidden, choice, radius)]
-            goal = within_reach(np.array([*covered[:, :2].mean(axis=0), _LOOK_HEIGHT_M]))
+            goal = within_reach(np.array([*covered[:, :2].mean(axis=0), self.look_height_m]))
             family = self._kinematics.goal_configurations_at_tool_angle(goal, _UP, q[6])
             if not len(family):
                 continue
@@ -247,7 +247,7 @@ class StillTargetServo:
             if worth > best:
                 best, self._look = worth, goal
         if self._look is None:
-            self._look = within_reach(np.array([*choices[0, :2], _LOOK_HEIGHT_M]))
+            self._look = within_reach(np.array([*choices[0, :2], self.look_height_m]))
         return self._look
 
 
@@ -282,7 +282,7 @@ def _calibration_sigma(spec: PlacingSpec) -> float:
 
 def _check(spec: PlacingSpec) -> None:
     """Refuse what the method does not do, in a sentence."""
-    names = observation_names(spec.observations)
+    names = spec.observed
     if not {"eih", "eth"} & set(names) or not {"joint_positions", "joint_velocities"} <= set(names):
         raise PolicyError(
             "servo needs a camera, joint_positions and joint_velocities; use the preset 'vision'"

@@ -11,15 +11,12 @@ import numpy.typing as npt
 
 from hvs_suite.cell.cameras import project
 from hvs_suite.cell.marker import HALF_THICKNESS_M
-from hvs_suite.tasks.shared.detection import Disc
+from hvs_suite.tasks.shared.detection import DRAWN_AREA, Disc
 
 FloatArray = npt.NDArray[np.float64]
 
 DISC_PLANE_M = 2.0 * HALF_THICKNESS_M
 """Height of the disc's face above the surface (m)."""
-# The renderer draws a disc as a polygon of 20 sides within the circle; a practitioner would
-# calibrate the same factor on a picture of the target at a known distance.
-DRAWN_AREA = float(np.sin(2.0 * np.pi / 20) / (2.0 * np.pi / 20))
 
 # Standard deviations. A centre of area is good to a fraction of a pixel, less where few pixels
 # show it; encoders are zeroed to about the following.

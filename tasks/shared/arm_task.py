@@ -341,6 +341,11 @@ class ArmTask(composer.Task):
         return self._scenario
 
     @property
+    def instruction(self) -> str:
+        """The task as one sentence; the one that fits all scenarios before the first reset."""
+        return self.spec.instruction(self._scenario)
+
+    @property
     def reward_terms(self) -> dict[str, float]:
         """Reward terms of the last control step by name."""
         return dict(self._reward_terms)

@@ -1,4 +1,4 @@
-"""Red discs in a picture: colour segmentation, then moments with sub-pixel edges.
+"""Coloured discs in a picture: colour segmentation, then moments with sub-pixel edges.
 
 A plain classical method on purpose. The certificates use it to prove that a target can be seen: if
 it finds the disc under a variant's own light, colours, texture and noise, the picture holds what
@@ -6,6 +6,9 @@ the task needs. The ``servo`` baseline uses it to solve the task.
 """
 
 import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,8 +22,27 @@ FloatArray = npt.NDArray[np.float64]
 _MAX_OTHER_PIXEL = 0.55
 _MIN_RED_LEAD = 25
 _MAX_OTHER_PATCH = 0.35
+_LEADS: Mapping[str, tuple[float, float, float]] = MappingProxyType(
+    {
+        "red": (1.0, -0.5, -0.5),
+        "blue": (-0.5, -0.5, 1.0),
+        "green": (-0.5, 1.0, -0.5),
+        "yellow": (0.5, 0.5, -1.0),
+    }
+)
+"""What tells a colour from grey: weights of the channels, which add up to nothing."""
+_HUES_DEG: Mapping[str, tuple[float, float]] = MappingProxyType(
+    {"blue": (195.0, 260.0), "green": (95.0, 175.0), "yellow": (40.0, 70.0)}
+)
+_MIN_SATURATION = 0.4
 _MIN_PIXELS = 2
-_MAX_DISCS = 6
+_MAX_DISCS = 8
+# A square of the same size has 1.27 times the area of a disc, a ring 0.75 times, half a disc half.
+_AREA_SHARE = (0.88, 1.13)
+_MAX_SPREAD = 1.3
+# The renderer draws a disc as a polygon of 20 sides within the circle; a practitioner would
+# calibrate the same factor on a picture of the target at a known distance.
+DRAWN_AREA = float(np.sin(2.0 * np.pi / 20) / (2.0 * np.pi / 20))
 # Rows and columns around a patch that hold its edge, and the background beyond.
 _EDGE_PX = 2
 _BACKGROUND_PX = 2
@@ -28,17 +50,21 @@ _BACKGROUND_PX = 2
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Disc:
-    """A red patch that may be the target.
+    """A coloured patch that may be the target.
 
     Attributes:
         centre: Centre of area, u and v (px, pixel centres whole), (2,).
-        area: Area (px^2), pixels on the edge counted by how red they are.
+        area: Area (px^2), pixels on the edge counted by how coloured they are.
         is_cut: Whether it touches the border of the picture.
+        spread: 4 pi times the root of the determinant of its second moments, over its area: how
+            far from the middle its parts are, whatever the slant from which one looks. 1 for a
+            disc, 1.05 for a square, 1.06 for half a disc, 1.67 for a ring of half its diameter.
     """
 
     centre: FloatArray
     area: float
     is_cut: bool
+    spread: float = 1.0
 
     @property
     def diameter(self) -> float:
@@ -46,44 +72,110 @@ class Disc:
         return 2.0 * float(np.sqrt(self.area / np.pi))
 
 
-def find_discs(image: npt.NDArray[np.uint8]) -> list[Disc]:
-    """Find the red patches.
+def find_discs(image: npt.NDArray[np.uint8], colour: str = "red") -> list[Disc]:
+    """Find the patches of a colour.
 
     Args:
         image: RGB, uint8 (H, W, 3).
+        colour: ``red``, ``blue``, ``green`` or ``yellow``.
 
     Returns:
-        Up to six patches, the largest first.
+        Up to eight patches, the largest first.
     """
+    found = _red_patches(image) if colour == "red" else _patches_of_hue(image, _HUES_DEG[colour])
+    if found is None:
+        return []
+    labels, stats, is_target = found
+    is_target &= stats[:, cv2.CC_STAT_AREA] >= _MIN_PIXELS
+    is_target[0] = False
+    chosen = np.flatnonzero(is_target)
+    chosen = chosen[np.argsort(-stats[chosen, cv2.CC_STAT_AREA], kind="stable")][:_MAX_DISCS]
+    return [_measure(image, labels, stats[each], int(each), _LEADS[colour]) for each in chosen]
+
+
+_Patches = tuple[npt.NDArray[np.int32], npt.NDArray[Any], npt.NDArray[np.bool_]]
+"""Label of each pixel (H, W), OpenCV's figures of each label, and whether its colour is right."""
+
+
+def _red_patches(image: npt.NDArray[np.uint8]) -> _Patches | None:
     red = image[..., 0].astype(np.int16)
     other = np.maximum(image[..., 1], image[..., 2]).astype(np.int16)
     warm = (other < _MAX_OTHER_PIXEL * red) & (red - other > _MIN_RED_LEAD)
     if not warm.any():
-        return []
+        return None
     count, patches, stats, _ = cv2.connectedComponentsWithStats(
         warm.astype(np.uint8), connectivity=8
     )
     labels = np.asarray(patches, np.int32)
     owner = labels[warm]
     sums = [np.bincount(owner, image[..., c][warm], count) for c in range(3)]
-    is_red = np.maximum(sums[1], sums[2]) < _MAX_OTHER_PATCH * sums[0]
-    is_red &= stats[:, cv2.CC_STAT_AREA] >= _MIN_PIXELS
-    is_red[0] = False
-    found = np.flatnonzero(is_red)
-    found = found[np.argsort(-stats[found, cv2.CC_STAT_AREA], kind="stable")][:_MAX_DISCS]
-    return [_measure(image, labels, stats[label], int(label)) for label in found]
+    return labels, stats, np.maximum(sums[1], sums[2]) < _MAX_OTHER_PATCH * sums[0]
 
 
-def find_disc(image: npt.NDArray[np.uint8]) -> Disc | None:
-    """Find the largest red patch.
+def _patches_of_hue(image: npt.NDArray[np.uint8], hue_deg: tuple[float, float]) -> _Patches | None:
+    # OpenCV counts hues in steps of 2 deg, so that they fit into a byte.
+    low = np.array([hue_deg[0] / 2, 255 * _MIN_SATURATION, 25])
+    high = np.array([hue_deg[1] / 2, 255, 255])
+    is_painted = cv2.inRange(cv2.cvtColor(image, cv2.COLOR_RGB2HSV), low, high)
+    if not is_painted.any():
+        return None
+    count, patches, stats, _ = cv2.connectedComponentsWithStats(is_painted, connectivity=8)
+    return np.asarray(patches, np.int32), stats, np.ones(count, bool)
+
+
+def find_disc(image: npt.NDArray[np.uint8], colour: str = "red") -> Disc | None:
+    """Find the largest patch of a colour.
 
     Args:
         image: RGB, uint8 (H, W, 3).
+        colour: As in `find_discs`.
 
     Returns:
-        The disc, or None where nothing is red enough.
+        The disc, or None where nothing is coloured enough.
     """
-    return next(iter(find_discs(image)), None)
+    return next(iter(find_discs(image, colour)), None)
+
+
+def is_whole_disc(disc: Disc, expected_px2: float) -> bool:
+    """Whether a patch can be a disc of known size, seen as a whole: by its area and its spread.
+
+    Args:
+        disc: The patch.
+        expected_px2: Area that the disc would have there (px^2).
+    """
+    low, high = _AREA_SHARE
+    share = disc.area / expected_px2
+    return not disc.is_cut and low <= share <= high and disc.spread <= _MAX_SPREAD
+
+
+def find_level_disc(
+    image: npt.NDArray[np.uint8], colour: str, K: FloatArray, T: FloatArray, diameter_m: float
+) -> Disc | None:
+    """Find the disc of a colour and a size that lies on the plane z = 0, among other outlines.
+
+    A small level patch of area A that a camera sees from a height h at a depth d along its axis
+    has the area A f^2 h / d^3 in the picture (f is the focal length in px).
+
+    Args:
+        image: RGB, uint8 (H, W, 3).
+        colour: As in `find_discs`.
+        K: Intrinsics, (3, 3) px.
+        T: Extrinsics, (4, 4), base to optical frame.
+        diameter_m: Diameter of the disc (m).
+
+    Returns:
+        The largest that can be it, or None.
+    """
+    eye = -T[:3, :3].T @ T[:3, 3]
+    drawn_m2 = DRAWN_AREA * np.pi / 4.0 * diameter_m**2
+    for disc in find_discs(image, colour):
+        ray = T[:3, :3].T @ np.linalg.solve(K, [*disc.centre, 1.0])
+        # The ray has a depth of 1.
+        if ray[2] < 0.0:
+            depth = -eye[2] / ray[2]
+            if is_whole_disc(disc, drawn_m2 * K[0, 0] ** 2 * eye[2] / depth**3):
+                return disc
+    return None
 
 
 def _measure(
@@ -91,8 +183,9 @@ def _measure(
     labels: npt.NDArray[np.int32],
     box: npt.NDArray[np.integer],
     label: int,
+    lead_of: tuple[float, float, float],
 ) -> Disc:
-    """Moments of one patch, each pixel weighed by how far it lies from background to disc red."""
+    """Moments of one patch, each pixel weighed by how far it lies from background to its colour."""
     left, top, width, height = (int(value) for value in box[:4])
     rows, columns = labels.shape
     margin = _EDGE_PX + _BACKGROUND_PX
@@ -100,7 +193,7 @@ def _measure(
     c0, c1 = max(0, left - margin), min(columns, left + width + margin)
     window = image[r0:r1, c0:c1].astype(np.float64)
     # Linear in the channels, so that pixel noise has no mean here.
-    lead = window[..., 0] - 0.5 * (window[..., 1] + window[..., 2])
+    lead = window @ np.array(lead_of)
     own = (labels[r0:r1, c0:c1] == label).astype(np.uint8)
     square = np.ones((3, 3), np.uint8)
     near = cv2.dilate(own, square, iterations=_EDGE_PX).astype(bool)
@@ -112,11 +205,12 @@ def _measure(
     total = float(weight.sum())
     if total <= 0.0:
         weight, total = own.astype(np.float64), float(own.sum())
-    centre = np.array(
-        [
-            c0 + float(weight.sum(axis=0) @ np.arange(c1 - c0)) / total,
-            r0 + float(weight.sum(axis=1) @ np.arange(r1 - r0)) / total,
-        ]
-    )
+    u, v = np.arange(c1 - c0), np.arange(r1 - r0)
+    along, down = weight.sum(axis=0), weight.sum(axis=1)
+    mu, mv = float(along @ u) / total, float(down @ v) / total
+    centre = np.array([c0 + mu, r0 + mv])
     is_cut = left == 0 or top == 0 or left + width == columns or top + height == rows
-    return Disc(centre, total, is_cut)
+    uu, vv = float(along @ (u - mu) ** 2) / total, float(down @ (v - mv) ** 2) / total
+    uv = float((v - mv) @ weight @ (u - mu)) / total
+    spread = 4.0 * np.pi * float(np.sqrt(max(uu * vv - uv**2, 0.0))) / total
+    return Disc(centre, total, is_cut, spread)

@@ -29,6 +29,7 @@ from dm_env import specs
 from hvs_suite.cell.cameras import CameraImage
 from hvs_suite.cell.physics import Physics
 from hvs_suite.cell.renderer import Renderer
+from hvs_suite.cell.solid import Solid
 from hvs_suite.errors import ScenarioError
 from hvs_suite.tasks.shared.arm_task import ArmTask
 from hvs_suite.tasks.shared.goal import Goal
@@ -246,6 +247,16 @@ class Environment(composer.Environment):
     def pending_setpoints(self) -> list[FloatArray]:
         """True set points that were commanded and still wait out the latency, oldest first."""
         return self._arm.pending_setpoints()
+
+    @property
+    def instruction(self) -> str:
+        """The task of this episode as one sentence; the sentence that fits all before a reset."""
+        return self._arm.instruction
+
+    @property
+    def obstacles(self) -> tuple[Solid, ...]:
+        """What the arm must keep out of beside the surface."""
+        return self._arm.family.obstacles()
 
     def goal(self, ahead_s: float = 0.0) -> Goal:
         """Where the tool's tip has to be now, or some time from now (s)."""

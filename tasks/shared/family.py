@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from dm_control import mjcf
 
     from hvs_suite.cell.arena import Cell
+    from hvs_suite.cell.solid import Solid
     from hvs_suite.cell.surface import Surface
     from hvs_suite.tasks.shared.certificate import Check
     from hvs_suite.tasks.shared.environment import Environment
@@ -152,6 +153,14 @@ class Family[S: Spec, C: Scenario](abc.ABC):
     def is_forbidden(self, physics: "mjcf.Physics") -> bool:
         """Whether a contact that exists now must never happen; asked after every physics step."""
         return bool(physics.data.ptr.ncon)
+
+    def observe(self, physics: "mjcf.Physics") -> dict[str, FloatArray]:
+        """The spec's further observations, now, by name."""
+        return {}
+
+    def obstacles(self) -> "tuple[Solid, ...]":
+        """What the arm must keep out of beside the surface; of what moves, all that it sweeps."""
+        return ()
 
     def privileged(self) -> dict[str, FloatArray]:
         """Further values that only training and the expert may see, by name."""

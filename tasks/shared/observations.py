@@ -15,7 +15,6 @@ from dm_env import specs
 
 from hvs_suite.cell import cameras
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
-from hvs_suite.tasks.shared.spec import observation_names
 
 if TYPE_CHECKING:
     from hvs_suite.tasks.shared.arm_task import ArmTask
@@ -62,17 +61,20 @@ def make_observables(task: "ArmTask") -> dict[str, observable.Observable]:
     Returns:
         Observables by name: ``eih``, ``eth`` uint8 (H, W, C); ``eih_depth``, ``eth_depth`` float32
         (H, W, 1) m; ``joint_positions`` (7,) rad, ``joint_velocities`` (7,) rad/s, as measured;
-        privileged: ``flange_position``, ``goal_position`` (3,) m, ``goal_normal`` (3,). With
-        ``normalise_observation`` pictures are float32 in [0, 1] and joints in [-1, 1].
+        privileged: ``flange_position``, ``goal_position`` (3,) m, ``goal_normal`` (3,); and what
+        the family adds. With ``normalise_observation`` pictures are float32 in [0, 1] and joints
+        in [-1, 1].
     """
     spec = task.spec
     bank = _noise_bank(spec.image_noise) if spec.image_noise > 0 else None
     built: dict[str, observable.Observable] = {}
-    for name in observation_names(spec.observations):
+    for name in spec.observed:
         if name in ("eih", "eth"):
             built[name] = _picture(task, name, bank)
         elif name in ("eih_depth", "eth_depth"):
             built[name] = _depth(task, name)
+        elif name in spec.further_observations:
+            built[name] = _of_family(task, name)
         else:
             built[name] = _vector(task, name)
         built[name].enabled = True
@@ -144,6 +146,16 @@ def _vector(task: "ArmTask", name: str) -> VectorObservable:
         return np.clip(read(physics), -bound, bound)
 
     return VectorObservable(saturated, specs.BoundedArray(bound.shape, np.float64, -bound, bound))
+
+
+def _of_family(task: "ArmTask", name: str) -> VectorObservable:
+    known = task.spec.further_observations[name]
+    shape = (len(known.dimensions),)
+
+    def read(physics: mjcf.Physics) -> FloatArray:
+        return np.clip(task.family.observe(physics)[name], known.low, known.high)
+
+    return VectorObservable(read, specs.BoundedArray(shape, np.float64, known.low, known.high))
 
 
 def _noise_bank(sigma: float) -> npt.NDArray[np.int16]:

@@ -135,6 +135,21 @@ class Disturbances:
 
 
 @dataclasses.dataclass(frozen=True)
+class VectorObservation:
+    """A vector that a family shows beside cameras and joints.
+
+    Attributes:
+        dimensions: Names of its numbers.
+        low: Least value of each of them.
+        high: Largest value of each of them.
+    """
+
+    dimensions: tuple[str, ...]
+    low: float
+    high: float
+
+
+@dataclasses.dataclass(frozen=True)
 class Description:
     """A task in words, for tables, cards and pictures.
 
@@ -167,7 +182,8 @@ class Spec(Timing, Cameras, Disturbances):
             a few centimetres and degrees from the goal pose; ``mixed``, half the task's ``zero``
             or ``random`` start, half ``near_goal``; or seven angles (rad).
         observations: Preset, or names joined by ``+``: ``eih``, ``eth``, ``eih_depth``,
-            ``eth_depth``, ``joint_positions``, ``joint_velocities``.
+            ``eth_depth``, ``joint_positions``, ``joint_velocities``, and what the family adds
+            (``further_observations``), which presets show as well.
         normalise_observation: Images to [0, 1] and joints to [-1, 1], as in the thesis.
         action_mode: Meaning of the seven (``flange_twist``: six) action numbers.
         rewards: Reward terms that are switched on; never changes success or termination.
@@ -199,7 +215,7 @@ class Spec(Timing, Cameras, Disturbances):
             OptionError: One of them does not.
         """
         _check_types(self)
-        observation_names(self.observations)
+        _ = self.observed
         self._check_cameras()
         self._check_timing()
         if isinstance(self.start, tuple):
@@ -356,6 +372,16 @@ class Spec(Timing, Cameras, Disturbances):
         return 0.78
 
     @property
+    def further_observations(self) -> Mapping[str, VectorObservation]:
+        """What the family shows beside cameras and joints, by name; see `Family.observe`."""
+        return {}
+
+    @property
+    def observed(self) -> tuple[str, ...]:
+        """Names of the observations, in order."""
+        return observation_names(self.observations, tuple(self.further_observations))
+
+    @property
     def scene_fields(self) -> tuple[str, ...]:
         """Names of the fields that shape the scene; see `scene`."""
         return tuple(
@@ -434,11 +460,12 @@ def in_words(choice: object) -> str:
     return str(choice)
 
 
-def observation_names(observations: str) -> tuple[str, ...]:
+def observation_names(observations: str, further: tuple[str, ...] = ()) -> tuple[str, ...]:
     """Names behind a preset or a list joined by ``+``.
 
     Args:
         observations: ``vision``, ``state``, or names such as ``eih+joint_positions``.
+        further: What the family adds; presets show it as well.
 
     Returns:
         Names in the order given.
@@ -447,13 +474,13 @@ def observation_names(observations: str) -> tuple[str, ...]:
         OptionError: A name is unknown or stands twice, or no camera is left.
     """
     if observations in PRESETS:
-        return PRESETS[observations]
+        return PRESETS[observations] + further
     names = tuple(observations.split("+"))
     for name in names:
-        if name not in VISION_OBSERVATIONS:
+        if name not in VISION_OBSERVATIONS + further:
             raise OptionError(
                 f"unknown observation {name!r}; use {', '.join(PRESETS)}, or join some of "
-                f"{', '.join(VISION_OBSERVATIONS)} with '+'"
+                f"{', '.join(VISION_OBSERVATIONS + further)} with '+'"
             )
     if len(set(names)) < len(names):
         raise OptionError(f"observations {observations!r} name something twice")

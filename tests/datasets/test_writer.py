@@ -65,9 +65,9 @@ def episodes(features):
 
 def write(root, features, episodes, block):
     """Writes episodes with our writer."""
-    files = DatasetWriter(root, features, FPS, SENTENCE, block)
+    files = DatasetWriter(root, features, FPS, block)
     for scenario, frames in enumerate(episodes):
-        files.save(packed(scenario, frames, features, OUTCOME))
+        files.save(packed(scenario, frames, features, OUTCOME, SENTENCE))
     files.publish()
 
 
@@ -207,13 +207,13 @@ def test_a_kill_between_the_last_two_files_costs_no_more_than_the_block(
     write(whole, features, episodes, 50)
     write(torn, features, episodes[:3], 1)
     # As if the statistics of the third block had arrived, and its counts had not.
-    lerobot_files.write_info(torn, features, FPS, ROBOT_TYPE, 2, sum(LENGTHS[:2]))
+    lerobot_files.write_info(torn, features, FPS, ROBOT_TYPE, 2, sum(LENGTHS[:2]), 1)
     with writer.taken(torn, resume=True):
         pass
     assert len(list((torn / "data").rglob("*.parquet"))) == 2
-    files = DatasetWriter(torn, features, FPS, SENTENCE, 2)
+    files = DatasetWriter(torn, features, FPS, 2)
     for scenario in (2, 3):
-        files.save(packed(scenario, episodes[scenario], features, OUTCOME))
+        files.save(packed(scenario, episodes[scenario], features, OUTCOME, SENTENCE))
     assert columns(torn)["action"] == columns(whole)["action"]
     one, two = (json.loads((root / lerobot_files.STATS).read_text()) for root in (whole, torn))
     for feature, names in one.items():
@@ -238,8 +238,8 @@ def test_a_data_file_ends_where_lerobot_would_end_it(features, episodes, tmp_pat
 
 def test_what_was_torn_by_an_interrupt_is_dropped(features, episodes, tmp_path, monkeypatch):
     root = tmp_path / "interrupted"
-    files = DatasetWriter(root, features, FPS, SENTENCE, 2)
-    files.save(packed(0, episodes[0], features, OUTCOME))
+    files = DatasetWriter(root, features, FPS, 2)
+    files.save(packed(0, episodes[0], features, OUTCOME, SENTENCE))
     rows = pq.ParquetWriter.write_table
 
     def interrupt(*arguments):
@@ -249,7 +249,7 @@ def test_what_was_torn_by_an_interrupt_is_dropped(features, episodes, tmp_path, 
     with monkeypatch.context() as patched:
         patched.setattr(pq.ParquetWriter, "write_table", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            files.save(packed(1, episodes[1], features, OUTCOME))
+            files.save(packed(1, episodes[1], features, OUTCOME, SENTENCE))
     files.publish()
     assert not (root / STAGE).exists()
     assert listing(root) == []
