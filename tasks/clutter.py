@@ -204,7 +204,7 @@ class Clutter(Placing[ClutterSpec, ClutterScenario]):
         spec = self.spec
         if not spec.n_distractors[1]:
             return []
-        kinds: "list[tuple[Shape, str]]" = [
+        kinds: list[tuple[Shape, str]] = [
             ("disc", colour) for colour in COLOURS if colour not in spec.colours
         ]
         kinds += [(outline, colour) for outline in OUTLINES for colour in spec.colours]

@@ -14,7 +14,7 @@ from hvs_suite.tasks.shared.start import steps_lower_bound
 def test_expert_figures_meet_the_bound(capsys):
     assert run(["bench", "--expert", "--episodes", "15", "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)
-    assert set(figures) == {"task", *LABELS}
+    assert set(figures) == {"task", "options", *LABELS}
     assert figures["task"] == "align-thesis"
     assert (figures["successes"], figures["collisions"]) == (15, 0)
     assert figures["speed_bound_s"] < figures["bound_s"] < 0.1 * figures["mean_steps"]
