@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from hvs_suite.cell.embodiment import BARE_ARM, Embodiment
 from hvs_suite.cell.kinematics import away_from_stops, kinematics, travel_time
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
 from hvs_suite.errors import LockError
@@ -139,7 +140,7 @@ def check_geometry(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
     for index in scenarios:
         env.reset(scenario=index)
         goal = env.task.goal()
-        margins.append(joint_margin_deg(goal))
+        margins.append(joint_margin_deg(goal, spec.embodiment))
         bounds.append(steps_lower_bound(spec, env.scenario.start, goal))
     env.draws = True
     limit = spec.time_limit_steps
@@ -462,9 +463,9 @@ def target_in(env: "Environment", camera: str) -> FloatArray:
     return found
 
 
-def joint_margin_deg(goal: Goal) -> float:
+def joint_margin_deg(goal: Goal, embodiment: Embodiment = BARE_ARM) -> float:
     """Least margin to a joint stop in a goal's best posture (deg); -inf if it is out of reach."""
-    family = kinematics().goal_configurations(goal.position, goal.normal)
+    family = kinematics(embodiment).goal_configurations(goal.position, goal.normal)
     if not len(family):
         return -math.inf
     return float(np.rad2deg((JOINT_RANGE_RAD - np.abs(family)).min(axis=1).max()))
