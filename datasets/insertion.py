@@ -18,7 +18,7 @@ from hvs_suite.tasks.shared.goal import HEIGHT, LATERAL, TILT, Goal, Tip, goal_e
 
 FloatArray = npt.NDArray[np.float64]
 
-ABOVE_MM = 40.0
+ABOVE_MM = 50.0
 """How far above the mouth the planner brings the tip (mm)."""
 NEAR_MM = 0.5
 """A set point so near to the axis (mm) goes down along it."""

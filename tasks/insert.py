@@ -40,7 +40,7 @@ FloatArray = npt.NDArray[np.float64]
 DEPTH = "depth_error_mm"
 PEAK_FORCE = "peak_force_n"
 WRENCH = "wrench"
-LIFT_M = 0.040
+LIFT_M = 0.050
 """How far above the mouth the tip comes from (m): the peg does not hide the bushing yet."""
 BOTTOM_M = 0.003
 """Material below the hole; as the cell's, spelled out because that loads MuJoCo."""
@@ -157,6 +157,11 @@ class InsertSpec(RingSpec):
     def top_m(self) -> float:
         """Height of the hole's mouth above the surface (m)."""
         return BOTTOM_M + self.hole_depth_m
+
+    @property
+    def look_from_m(self) -> float:
+        """So high that the peg does not hide the bushing."""
+        return LIFT_M
 
     @property
     def metrics(self) -> tuple[Metric, ...]:

@@ -7,6 +7,7 @@ from typing import Any, Protocol
 
 from hvs_suite.errors import PolicyError
 from hvs_suite.rollout import Policy
+from hvs_suite.tasks.insert import InsertSpec
 from hvs_suite.tasks.shared.spec import Spec
 
 
@@ -26,6 +27,7 @@ def make_servo(env: Playground) -> Policy:
     """
     from hvs_suite.policies.servo.among_others import AmongOthersServo
     from hvs_suite.policies.servo.changing_target import ChangingTargetServo
+    from hvs_suite.policies.servo.insertion import InsertionServo
     from hvs_suite.policies.servo.moving_target import MovingTargetServo
     from hvs_suite.policies.servo.still_target import StillTargetServo
 
@@ -34,9 +36,24 @@ def make_servo(env: Playground) -> Policy:
         "sequence": ChangingTargetServo,
         "track": MovingTargetServo,
         "clutter": AmongOthersServo,
+        "insert": InsertionServo,
     }
     spec = env.spec
     if spec.family not in servos:
         raise PolicyError(f"servo does not know tasks of family {spec.family}")
     servo: Policy = servos[spec.family](spec)
     return servo
+
+
+def make_push(env: Playground) -> Policy:
+    """``push`` for an environment: as ``servo``, but straight down where the hole is seen.
+
+    Raises:
+        PolicyError: There is nothing to insert.
+    """
+    from hvs_suite.policies.servo.insertion import InsertionServo
+
+    spec = env.spec
+    if not isinstance(spec, InsertSpec):
+        raise PolicyError(f"push inserts pegs; tasks of family {spec.family} have none")
+    return InsertionServo(spec, searches=False)

@@ -88,6 +88,11 @@ class RingSpec(Spec):
         """Outer radius of the ring (m)."""
         return self.ring_m[1]
 
+    @property
+    def look_from_m(self) -> float:
+        """How far above the target the tip is where the eye in the hand sees it best (m)."""
+        raise NotImplementedError
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PlacingSpec(RingSpec):
@@ -146,6 +151,11 @@ class PlacingSpec(RingSpec):
             Metric(HEIGHT, "mm", "height error", self.height_tolerance_mm),
             Metric(TILT, "deg", "tilt error", self.tilt_tolerance_deg),
         )
+
+    @property
+    def look_from_m(self) -> float:
+        """At the goal."""
+        return self.standoff_m
 
     @property
     def landing_metric(self) -> Metric | None:
