@@ -395,7 +395,7 @@ register(
         clearance_mm=0.2,
         chamfer_mm=0.5,
         force_limit_n=60.0,
-        joint_offset_deg=0.05,
+        joint_offset_deg=0.03,
         **HARD,
     ),
     dataclasses.replace(

@@ -23,8 +23,8 @@ BOTTOM_M = 0.003
 """Thickness of the material below the hole (m)."""
 _SECTORS = 24
 _SECTIONS = 48
-_PAINT_M = 0.00025
-"""Thickness of the painted ring (m)."""
+_PAINT_M = 0.00005
+"""Thickness of the painted ring (m): its side must not show."""
 
 
 class Bushing(Marker):
@@ -51,8 +51,9 @@ class Bushing(Marker):
         )
         outer, inner, top = 0.5 * diameter_m, 0.5 * hole_diameter_m, BOTTOM_M + hole_depth_m
         mouth = inner + chamfer_m
+        under = top - _PAINT_M
         self._geom = self._add(
-            "face", [(mouth, top), (outer, top), (outer, top + _PAINT_M), (mouth, top + _PAINT_M)]
+            "face", [(mouth, under), (outer, under), (outer, top), (mouth, top)]
         )
         self._add(
             "body",
@@ -73,6 +74,10 @@ class Bushing(Marker):
             profile = [*profile, profile[0]]
         mesh = trimesh.creation.revolve(np.array(profile), sections=_SECTIONS)
         mesh.fix_normals()
+        if name == "body":
+            # The paint is its upper face: two so near to each other would flicker.
+            top = max(height for _, height in profile)
+            mesh.update_faces((mesh.triangles[:, :, 2] < top - 1e-9).any(axis=1))
         self._root.asset.add(
             "mesh",
             name=name,

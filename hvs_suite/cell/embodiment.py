@@ -37,7 +37,7 @@ class Tool:
 
     peg_diameter_m: float = 0.010
     peg_length_m: float = 0.050
-    edge_m: float = 0.00025
+    edge_m: float = 0.0001
 
     @property
     def length_m(self) -> float:

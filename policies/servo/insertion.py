@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from hvs_suite.datasets.insertion import GATE_MM, GuardedInsertion
 from hvs_suite.policies.servo.still_target import StillTargetServo
+from hvs_suite.policies.servo.target_estimate import DISC_PLANE_M, Sight
 from hvs_suite.rollout import Observation
 from hvs_suite.tasks.insert import WRENCH, InsertSpec
 from hvs_suite.tasks.shared.feeling import HoleSearch, search_of
@@ -40,11 +41,14 @@ class InsertionServo(StillTargetServo):
     measures_height = False
 
     def __init__(self, spec: InsertSpec, *, searches: bool = True) -> None:
-        self.face_m = spec.top_m
+        self.face_m = spec.top_m - DISC_PLANE_M
         self._depth_m = spec.goal_depth_m
         self._how = search_of(spec.clearance_mm, spec.chamfer_mm, spec.hole_noise_mm, searches)
         self._guarded = GuardedInsertion(spec.control_period_s, spec.embodiment)
         super().__init__(spec)
+        mouth_m = spec.peg_diameter_m + 0.002 * (spec.clearance_mm + spec.chamfer_mm)
+        hole_share = (mouth_m / spec.target_diameter_m) ** 2
+        self._sight = Sight(spec.target_diameter_m, spec.ring_m, hole_share)
 
     def reset(self) -> None:
         """Forget the last episode."""
@@ -86,7 +90,7 @@ class InsertionServo(StillTargetServo):
         if not self._estimate.is_known or not np.isfinite(self._estimate.in_hand_sigma_m):
             return
         place, _ = self._estimate.place()
-        mouth = np.array([*place, self._face_height_m])
+        mouth = np.array([*place, self._face_height_m + DISC_PLANE_M])
         above = self._guarded.errors(q, Goal(mouth, UP))
         near = above[HEIGHT] < 1e3 * self._variant.look_from_m + _NEAR_MM
         self._n_looks += near and above[LATERAL] < _NEAR_MM

@@ -61,11 +61,15 @@ class Sight:
     Args:
         diameter_m: Diameter of the target (m).
         ring_m: Inner and outer radius of the ring of targets (m).
+        hole_share: Share of the disc's area that a hole in its middle takes.
     """
 
-    def __init__(self, diameter_m: float, ring_m: tuple[float, float]) -> None:
+    def __init__(
+        self, diameter_m: float, ring_m: tuple[float, float], hole_share: float = 0.0
+    ) -> None:
         self._diameter_m = diameter_m
         self._ring_m = ring_m
+        self._hole_share = hole_share
 
     def sighting(
         self, disc: Disc, K: FloatArray, T: FloatArray, surface_m: float
@@ -85,9 +89,10 @@ class Sight:
         expected = outline(place[0], self._diameter_m, K, T, height)
         if expected is None:
             return None
-        area, drawn_centre = expected[0] * DRAWN_AREA, expected[1]
+        area, drawn_centre = expected[0] * DRAWN_AREA * (1.0 - self._hole_share), expected[1]
         middle = project(np.array([*place[0], height]), K, T)[:2]
-        centre = disc.centre - (drawn_centre - middle)
+        # Perspective shifts a disc's centre with its area, so what a hole leaves the more.
+        centre = disc.centre - (1.0 + self._hole_share) * (drawn_centre - middle)
         # The point and its neighbours one pixel to the right and below: place and derivative.
         places = intersect(np.add(centre, [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), K, T, height)
         if places is None:
