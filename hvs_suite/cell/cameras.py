@@ -73,6 +73,26 @@ def extrinsics(position: FloatArray, rotation: FloatArray) -> FloatArray:
     return transform
 
 
+def extrinsics_of_hand(
+    rotation: FloatArray, position: FloatArray, embodiment: Embodiment
+) -> FloatArray:
+    """Transform from the base frame to the optical frame of the eye in the hand.
+
+    Args:
+        rotation: Of the flange frame in the base frame, (3, 3).
+        position: Of the flange face's centre, (3,) m, base frame.
+        embodiment: Says where on the flange the eye is.
+
+    Returns:
+        T, (4, 4), as in `extrinsics`.
+    """
+    axes, place = embodiment.hand_eye
+    T = np.eye(4)
+    T[:3, :3] = (rotation @ axes).T
+    T[:3, 3] = -T[:3, :3] @ (position + rotation @ place)
+    return T
+
+
 def project(points: npt.ArrayLike, K: FloatArray, T: FloatArray) -> FloatArray:
     """Project points into an image.
 

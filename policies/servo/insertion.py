@@ -46,9 +46,7 @@ class InsertionServo(StillTargetServo):
         self._how = search_of(spec.clearance_mm, spec.chamfer_mm, spec.hole_noise_mm, searches)
         self._guarded = GuardedInsertion(spec.control_period_s, spec.embodiment)
         super().__init__(spec)
-        mouth_m = spec.peg_diameter_m + 0.002 * (spec.clearance_mm + spec.chamfer_mm)
-        hole_share = (mouth_m / spec.target_diameter_m) ** 2
-        self._sight = Sight(spec.target_diameter_m, spec.ring_m, hole_share)
+        self._sight = Sight(spec.target_diameter_m, spec.ring_m, spec.hole_share)
 
     def reset(self) -> None:
         """Forget the last episode."""

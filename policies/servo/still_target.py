@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from hvs_suite.cell.cameras import extrinsics, intrinsics, look_at
+from hvs_suite.cell.cameras import extrinsics, extrinsics_of_hand, intrinsics, look_at
 from hvs_suite.cell.kinematics import kinematics, travel_time
 from hvs_suite.cell.robot import (
     BASE_TO_SHOULDER_M,
@@ -146,9 +146,7 @@ class StillTargetServo:
             turn = float(np.arccos(np.clip(0.5 * (np.trace(self._hand[0].T @ R) - 1), -1, 1)))
             self._estimate.move(float(np.linalg.norm(p - self._hand[1])), turn)
         self._hand = (R, p)
-        axes, eye = self._embodiment.hand_eye
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = (R @ axes).T, -(R @ axes).T @ (p + R @ eye)
+        T = extrinsics_of_hand(R, p, self._embodiment)
         seen = self._sighting(observation["eih"], self._eih_K, T) if self._has_eih else None
         if seen is not None:
             self._misses = 0

@@ -25,6 +25,7 @@ from hvs_suite.errors import LockError
 from hvs_suite.files import replacing
 from hvs_suite.tasks.shared.detection import Disc, find_disc
 from hvs_suite.tasks.shared.goal import Goal
+from hvs_suite.tasks.shared.metric import Metric
 from hvs_suite.tasks.shared.start import steps_lower_bound
 
 if TYPE_CHECKING:
@@ -430,6 +431,22 @@ def solved_check(n_success: int, n_collision: int, n: int, mean_steps: float) ->
         f"{n_success} of {n}, {n_collision}, {mean_steps:.2f}",
         "all, none",
         n_success == n and n_collision == 0,
+    )
+
+
+def limit_check(metric: Metric, values: Sequence[float]) -> Check:
+    """How near the expert comes to a limit whose breach ends an episode.
+
+    Args:
+        metric: What is limited.
+        values: The largest of each episode.
+    """
+    bound = math.inf if metric.bound is None else metric.bound
+    return Check(
+        f"safe: expert's {metric.title}, 99th percentile and largest",
+        f"{np.percentile(values, 99):.1f}, {max(values):.1f} {metric.unit}",
+        f"<= {bound:g} {metric.unit}",
+        max(values) <= bound,
     )
 
 

@@ -34,7 +34,7 @@ class Search:
     pitch_m: float
     step_m: float
     widest_m: float
-    press_n: float = 4.0
+    press_n: float = 2.0
     guard_n: float = 15.0
     down_m: float = 0.001
 
@@ -46,15 +46,16 @@ _PITCH = 1.6
 _STEP = 1.3
 """Distance of turns, and way in a control step, in units of what the mouth catches."""
 _TOUCHED_N = 2.0
-_IN_M = 0.0004
+_IN_M = 0.00012
 """So far below where it was first pressed, the tip is in the mouth."""
 _COMPLIANCE_M_N = 0.0002
 """How far the set point is lowered for each newton that is missing."""
 _LARGEST_PRESS_M = 0.001
-_FOLLOW = 0.5
-"""Share of the tip's distance from where it shall be that a control step adds to the set point:
-friction holds the tip back by more than the mouth is wide."""
+_FOLLOW = 0.3
+"""Share of the tip's distance from where it shall be that a control step adds to the set point."""
 _MAX_LEAD_M = 0.003
+_FRICTION_M_N = 0.0004
+"""How far friction holds the tip back for each newton that it is pressed with."""
 
 
 def search_of(clearance_mm: float, chamfer_mm: float, noise_mm: float, searches: bool) -> Search:
@@ -123,17 +124,17 @@ class HoleSearch:
     def _go_round(self, tip: FloatArray, force_n: float) -> None:
         """Go on along the spiral, keeping the force."""
         search = self._search
-        lead = self._lead + _FOLLOW * (self._wanted - tip[:2])
-        self._lead = lead * min(1.0, _MAX_LEAD_M / max(float(np.linalg.norm(lead)), 1e-12))
+        self._lead += _FOLLOW * (self._wanted - tip[:2])
+        self._lead *= min(1.0, _MAX_LEAD_M / max(float(np.linalg.norm(self._lead)), 1e-12))
         growth = search.pitch_m / (2.0 * math.pi)
-        radius = growth * self._turn
-        self._turn += search.step_m / math.hypot(radius, growth)
+        self._turn += search.step_m / math.hypot(growth * self._turn, growth)
         if growth * self._turn > search.widest_m:
             self._turn = 0.0
-        wanted = self._mouth[:2] + growth * self._turn * np.array(
-            [math.cos(self._turn), math.sin(self._turn)]
-        )
-        self._wanted = wanted
-        self._set_point[:2] = wanted + self._lead
+        c, s = math.cos(self._turn), math.sin(self._turn)
+        radius = growth * self._turn
+        self._wanted = self._mouth[:2] + radius * np.array([c, s])
+        along = np.array([growth * c - radius * s, growth * s + radius * c])
+        along *= _FRICTION_M_N * search.press_n / float(np.linalg.norm(along))
+        self._set_point[:2] = self._wanted + along + self._lead
         lower = _COMPLIANCE_M_N * (search.press_n - force_n)
         self._set_point[2] -= min(max(lower, -_LARGEST_PRESS_M), _LARGEST_PRESS_M)
