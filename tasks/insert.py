@@ -409,7 +409,7 @@ register(
     dataclasses.replace(
         _WIDE,
         name="insert-feel",
-        time_limit_steps=75,
+        time_limit_steps=65,
         clearance_mm=0.1,
         chamfer_mm=0.2,
         force_limit_n=40.0,

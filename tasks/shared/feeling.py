@@ -28,7 +28,8 @@ class Search:
         widest_m: Radius at which it begins anew, from the middle (m); 0 for pushing straight down.
         press_n: Force that the tip keeps on the face (N).
         guard_n: Force above which it does not go deeper (N).
-        down_m: Step down (m).
+        down_m: Step down onto the face (m).
+        in_m: Step down in the hole (m).
     """
 
     pitch_m: float
@@ -37,6 +38,7 @@ class Search:
     press_n: float = 2.0
     guard_n: float = 15.0
     down_m: float = 0.001
+    in_m: float = 0.0025
 
 
 _WIDEST_SIGMA = 2.8
@@ -119,7 +121,7 @@ class HoleSearch:
         """Follow the mouth sideways, and go down."""
         self._set_point[:2] += _FOLLOW * (tip[:2] - self._set_point[:2])
         if force_n < self._search.guard_n:
-            self._set_point[2] -= self._search.down_m
+            self._set_point[2] -= self._search.in_m
 
     def _go_round(self, tip: FloatArray, force_n: float) -> None:
         """Go on along the spiral, keeping the force."""
