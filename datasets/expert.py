@@ -46,9 +46,7 @@ class Expert:
                 "task with action_mode='joint_position'."
             )
         self._env = env
-        self._planner = Planner(
-            spec.control_period_s, plain=plain, embodiment=spec.embodiment
-        )
+        self._planner = Planner(spec.control_period_s, plain=plain, embodiment=spec.embodiment)
         self._insertion = GuardedInsertion(spec.control_period_s, spec.embodiment)
         self._period_s = spec.control_period_s
         self._delay_s = spec.latency_steps * spec.control_period_s

@@ -399,9 +399,7 @@ class Planner:
         joints = family[:, :6].T
 
         def price(goals: FloatArray) -> FloatArray:
-            times, effort = _stopping_travel_time(
-                q[:6], velocity[:6], goals, self._acceleration
-            )
+            times, effort = _stopping_travel_time(q[:6], velocity[:6], goals, self._acceleration)
             return times + TIE_BREAK_S * effort + (_crowding(goals) if self._more_follow else 0.0)
 
         bound = (np.abs(joints - q[:6, None]) / _FULL_SPEED).max(axis=0)

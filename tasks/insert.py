@@ -292,7 +292,7 @@ class Insert(Family[InsertSpec, InsertScenario]):
         spec = self.spec
         place = np.array([*point_on_ring(spec.ring_m, streams.generator("target")), 0.0])
         offset = 0.001 * spec.hole_noise_mm * streams.cut_normal("hole", 2)
-        goal = Goal(place + [*offset, spec.top_m], UP, -spec.goal_depth_m)
+        goal = Goal(place + np.append(offset, spec.top_m), UP, -spec.goal_depth_m)
         own = self.named.start if self.named is not None else "zero"
         above = dataclasses.replace(goal, standoff_m=LIFT_M)
         start = draw_start(spec, own, streams, above, UP)
@@ -307,7 +307,7 @@ class Insert(Family[InsertSpec, InsertScenario]):
         super().begin(physics, scenario)
         data = physics.data.ptr
         painted = scenario.target
-        hole = painted + [*scenario.hole_offset, 0.0]
+        hole = painted + np.append(scenario.hole_offset, 0.0)
         data.mocap_pos[self._mocaps] = [painted, hole]
         # The picture that follows shows where bodies were computed to be.
         mujoco.mj_kinematics(physics.model.ptr, data)

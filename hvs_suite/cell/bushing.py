@@ -52,9 +52,7 @@ class Bushing(Marker):
         outer, inner, top = 0.5 * diameter_m, 0.5 * hole_diameter_m, BOTTOM_M + hole_depth_m
         mouth = inner + chamfer_m
         under = top - _PAINT_M
-        self._geom = self._add(
-            "face", [(mouth, under), (outer, under), (outer, top), (mouth, top)]
-        )
+        self._geom = self._add("face", [(mouth, under), (outer, under), (outer, top), (mouth, top)])
         self._add(
             "body",
             [

@@ -1,13 +1,14 @@
 """``servo``: classical hybrid visual servoing, as a practitioner would write it; no learning.
 
-One file a kind of task; `make_servo` is the one place that knows which family takes which.
+One file a kind of task; `make_servo` and `make_push` are the one place that knows which family
+takes which.
 """
 
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 from hvs_suite.errors import PolicyError
 from hvs_suite.rollout import Policy
-from hvs_suite.tasks.insert import InsertSpec
 from hvs_suite.tasks.shared.spec import Spec
 
 
@@ -38,22 +39,23 @@ def make_servo(env: Playground) -> Policy:
         "clutter": AmongOthersServo,
         "insert": InsertionServo,
     }
-    spec = env.spec
-    if spec.family not in servos:
-        raise PolicyError(f"servo does not know tasks of family {spec.family}")
-    servo: Policy = servos[spec.family](spec)
-    return servo
+    return _made("servo", servos, env)
 
 
 def make_push(env: Playground) -> Policy:
-    """``push`` for an environment: as ``servo``, but straight down where the hole is seen.
+    """``push``: as ``servo``, but straight down where it sees the hole; what sight alone is worth.
 
     Raises:
         PolicyError: There is nothing to insert.
     """
-    from hvs_suite.policies.servo.insertion import InsertionServo
+    from hvs_suite.policies.servo.insertion import PushServo
 
+    return _made("push", {"insert": PushServo}, env)
+
+
+def _made(name: str, servos: Mapping[str, type[Any]], env: Playground) -> Policy:
     spec = env.spec
-    if not isinstance(spec, InsertSpec):
-        raise PolicyError(f"push inserts pegs; tasks of family {spec.family} have none")
-    return InsertionServo(spec, searches=False)
+    if spec.family not in servos:
+        raise PolicyError(f"{name} does not know tasks of family {spec.family}")
+    servo: Policy = servos[spec.family](spec)
+    return servo

@@ -29,9 +29,11 @@ _ENTER_MM = 0.5
 class InsertionServo(StillTargetServo):
     """Inserts a peg; follows :class:`hvs_suite.rollout.Policy`.
 
+    Attributes:
+        searches: Whether it searches for a hole that is not where it was seen.
+
     Args:
         spec: The task's parameters.
-        searches: Whether it searches for a hole that is not where it was seen.
 
     Raises:
         PolicyError: The task needs what this method does not do.
@@ -39,11 +41,12 @@ class InsertionServo(StillTargetServo):
 
     # The hole and the tool's shadow make the face look smaller than it is.
     measures_height = False
+    searches = True
 
-    def __init__(self, spec: InsertSpec, *, searches: bool = True) -> None:
+    def __init__(self, spec: InsertSpec) -> None:
         self.face_m = spec.top_m - DISC_PLANE_M
         self._depth_m = spec.goal_depth_m
-        self._how = search_of(spec.clearance_mm, spec.chamfer_mm, spec.hole_noise_mm, searches)
+        self._how = search_of(spec.clearance_mm, spec.chamfer_mm, spec.hole_noise_mm, self.searches)
         self._guarded = GuardedInsertion(spec.control_period_s, spec.embodiment)
         super().__init__(spec)
         self._sight = Sight(spec.target_diameter_m, spec.ring_m, spec.hole_share)
@@ -94,3 +97,9 @@ class InsertionServo(StillTargetServo):
         self._n_looks += near and above[LATERAL] < _NEAR_MM
         if self._n_looks >= _LOOKS:
             self._mouth = mouth
+
+
+class PushServo(InsertionServo):
+    """Goes straight down where it sees the hole."""
+
+    searches = False

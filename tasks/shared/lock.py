@@ -38,7 +38,8 @@ class LockEntry:
         version: Version of the task.
         parameters: Of its family and of the parameters that differ from the family's defaults, so
             that a new parameter does not change what it leaves alone.
-        robot: Of the robot's MJCF, as the task has it: chain, inertia, gains, collision bodies, tool.
+        robot: Of the robot's MJCF as the task has it: chain, inertia, gains, collision bodies,
+            tool.
         scene: Of the whole cell's MJCF (markers, light, cameras, materials, meshes), and of one
             painted texture where textures vary.
         test_scenarios: Of the digests of all test scenarios in order.

@@ -263,9 +263,7 @@ class Placing[S: PlacingSpec, C: Scenario](Family[S, C]):
         ]
 
 
-def point_on_ring(
-    ring_m: tuple[float, float], random: np.random.Generator
-) -> tuple[float, float]:
+def point_on_ring(ring_m: tuple[float, float], random: np.random.Generator) -> tuple[float, float]:
     """Draw a point of a ring, given by its radii, uniform in area (m, base frame)."""
     inner, outer = ring_m
     radius = math.sqrt(random.uniform(inner**2, outer**2))
@@ -277,5 +275,7 @@ def is_reachable(goal: Goal, embodiment: Embodiment = BARE_ARM) -> bool:
     """Whether the tip can be at a goal within the joint ranges."""
     from hvs_suite.cell.kinematics import kinematics
 
-    found = kinematics(embodiment).goal_configurations_at_tool_angle(goal.position, goal.normal, 0.0)
+    found = kinematics(embodiment).goal_configurations_at_tool_angle(
+        goal.position, goal.normal, 0.0
+    )
     return bool(len(found))
