@@ -89,7 +89,7 @@ def test_certificates_are_of_the_named_tasks_alone() -> None:
     assert names == {f"{task}.json" for task in hvs_suite.TASKS}
 
 
-@pytest.mark.parametrize("n", [15, pytest.param(TEST_SCENARIOS, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [20, pytest.param(TEST_SCENARIOS, marks=pytest.mark.slow)])
 @pytest.mark.each_task
 def test_the_certificate_holds_when_it_is_computed_anew(task: str, n: int) -> None:
     with hvs_suite.load(task, split="test") as env:
