@@ -9,7 +9,7 @@ not accept ``--policy.discover_packages_path`` beside ``--policy.path``. It impo
 takes some seconds.
 """
 
-import hvs_suite.policies.hvs.configuration_hvs  # noqa: F401 - registers the policy's type
+import hvs_suite.policies.hvs  # noqa: F401 - registers the policy's type
 from hvs_suite.lerobot_env.configuration import HvsEnvConfig
 
 __all__ = ["HvsEnvConfig"]
