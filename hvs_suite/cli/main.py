@@ -31,6 +31,7 @@ COMMANDS = {
     "view": "hvs_suite.cli.view:View",
     "record": "hvs_suite.cli.record:Record",
     "check": "hvs_suite.cli.check:Check",
+    "attach": "hvs_suite.cli.attach:Attach",
     "replay": "hvs_suite.cli.replay:Replay",
     "share": "hvs_suite.cli.share:Share",
     "fetch": "hvs_suite.cli.fetch:Fetch",
