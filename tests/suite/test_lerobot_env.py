@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -147,6 +148,25 @@ def test_what_lerobot_cannot_take_is_refused(package):
         package.HvsEnvConfig(split="").create_envs(1)
 
 
+def test_the_envhub_folder_is_what_lerobot_loads(monkeypatch):
+    from lerobot.envs import make_env
+    from lerobot.envs.configs import HubEnvConfig
+
+    folder = Path(__file__).parents[2] / "integrations" / "envhub"
+    # In place of the Hub: the folder as it would be pushed.
+    monkeypatch.setattr(
+        "lerobot.envs.utils.hf_hub_download", lambda filename, **_: str(folder / filename)
+    )
+    suites = make_env("somebody/hvs", n_envs=2, trust_remote_code=True)
+    observation, _ = suites["align-easy"][0].reset(seed=[1000, 1001])
+    assert observation["pixels"]["eth"].shape == (2, 112, 112, 3)
+    asked = HubEnvConfig(hub_path="somebody/hvs", task="align-fixed,align-thesis")
+    others = make_env(asked, trust_remote_code=True)
+    assert list(others) == ["align-fixed", "align-thesis"]
+    for vectors in (suites | others).values():
+        vectors[0].close()
+
+
 def test_several_tasks_are_made_at_once_if_they_show_the_same(package):
     suites = package.HvsEnvConfig(task="track-line,align-easy", options=SMALL).create_envs(1)
     assert list(suites) == ["track-line", "align-easy"]
@@ -216,9 +236,9 @@ def act(package, tmp_path_factory):
 
 @pytest.mark.timeout(600)
 def test_lerobot_eval_scores_a_policy_on_several_tasks_in_one_call(act, tmp_path, capsys):
+    # No flag says where the environment is: an installed distribution does.
     command = [
         *(sys.executable, "-m", "lerobot.scripts.lerobot_eval"),
-        "--env.discover_packages_path=hvs_suite.lerobot_env",
         "--env.type=hvs",
         "--env.task=align-easy,track-line",
         "--env.episode_length=20",
