@@ -43,5 +43,5 @@ clean:  ## remove .venv, runs and caches
 	rm -rf .venv runs build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-.venv/.up-to-date: requirements.lock setup.cfg scripts/make_venv.sh
+.venv/.up-to-date: requirements.lock setup.cfg scripts/make_venv.sh integrations/lerobot_env_hvs/pyproject.toml
 	@scripts/make_venv.sh

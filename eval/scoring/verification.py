@@ -18,6 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from hvs_suite import registry, rollout
+from hvs_suite.datasets.lerobot_files import INFO
 from hvs_suite.errors import OptionError, ResultError
 from hvs_suite.eval.scoring import action_log, contender, result_file
 from hvs_suite.eval.scoring.result_file import EpisodeRow, Result
@@ -341,12 +342,14 @@ def results_in(paths: Sequence[Path]) -> list[Path]:
     """Returns the result files that are named or lie below the folders that are.
 
     Raises:
-        OptionError: There is none, or a path does not exist.
+        OptionError: There is none, or a path does not exist or is a dataset.
     """
     found: list[Path] = []
     for path in paths:
         if not path.exists():
             raise OptionError(f"{path} does not exist; name a result file or a folder of them")
+        if (path / INFO).exists():
+            raise OptionError(f"{path} is a dataset, no result; 'hvs check {path}' checks it")
         below = [Path(folder, name) for folder, _, names in os.walk(path) for name in names]
         found += sorted(f for f in below if f.suffix == ".json") if path.is_dir() else [path]
     if not found:

@@ -30,7 +30,7 @@ from hvs_suite.tasks.shared.option_types import listed
 from hvs_suite.tasks.shared.spec import Spec
 
 if TYPE_CHECKING:
-    from hvs_suite.policies.hvs.network import HvsNetwork
+    from hvs_suite.policies.network.network import HvsNetwork
     from hvs_suite.tasks.shared.environment import Environment
 
 # An error that falls by a fifth in so many steps is on its way to the goal.
