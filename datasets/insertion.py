@@ -69,7 +69,7 @@ class GuardedInsertion:
             if sent[LATERAL] < _CAUGHT_MM and sent[HEIGHT] < _CLEAR_MM:
                 return self.straight(set_point, self._raised(set_point, goal), goal)
             above = dataclasses.replace(goal, standoff_m=0.001 * ABOVE_MM)
-            return self._planner.next_set_point(joints, velocity, above, onward=goal)
+            return self._planner.next_set_point(joints, velocity, above)
         arm = self.errors(joints, goal)
         height = sent[HEIGHT]
         step = min(max(_BRAKING * (height - GATE_MM), SLOW_MM), FAST_MM)

@@ -40,12 +40,12 @@ def check_sight(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
         scenarios: Indices to check.
 
     Returns:
-        Checks of the lateral error and of the tilt; where the hole is off its paint, of what sight
+        Checks of the lateral error, the depth and the tilt; where the hole is off its paint, of what sight
         alone leaves.
     """
     spec = env.task.family.spec
     model = kinematics(spec.embodiment)
-    off_mm, left_mm, tilts = [], [], []
+    off_mm, deep_mm, left_mm, tilts = [], [], [], []
     env.draws = False
     for index in scenarios:
         env.reset(scenario=index)
@@ -58,12 +58,14 @@ def check_sight(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
         if seen is not None:
             wrong = (seen - believed_tip - (scenario.target - tip))[:2]
         off_mm.append(1000.0 * float(np.linalg.norm(wrong)))
+        deep_mm.append(1000.0 * abs(float(believed_tip[2] - tip[2])))
         left_mm.append(1000.0 * float(np.linalg.norm(wrong - scenario.hole_offset)))
         tilts.append(math.degrees(math.acos(min(1.0, float(R[:, 2] @ believed_R[:, 2])))))
     env.draws = True
     catch = spec.clearance_mm + spec.chamfer_mm
     budget = (
-        ("bushing's face in EIH", off_mm, catch, "mm"),
+        ("lateral from bushing's face in EIH", off_mm, catch, "mm"),
+        ("depth from joints", deep_mm, spec.depth_tolerance_mm, "mm"),
         ("tilt from joints", tilts, spec.tilt_tolerance_deg, "deg"),
     )
     checks = [
