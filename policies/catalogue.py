@@ -28,8 +28,8 @@ def policy_factory(spec: str, task: str, options: Mapping[str, Any] = AS_NAMED) 
     """Find a policy for a task.
 
     Args:
-        spec: ``expert``, ``servo``, ``push``, ``zero``, ``random``, ``pretrained``, ``finetuned`` (the
-            weights shipped for the task), a checkpoint folder, a checkpoint's Hub id
+        spec: ``expert``, ``servo``, ``push``, ``zero``, ``random``, ``pretrained``, ``finetuned``
+            (the weights shipped for the task), a checkpoint folder, a checkpoint's Hub id
             (``owner/name``), or ``module:factory`` for code of one's own, which is imported and run
             once the policy is built (see `hvs_suite.policies.imported`).
         task: Named task.

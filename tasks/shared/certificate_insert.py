@@ -40,8 +40,8 @@ def check_sight(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
         scenarios: Indices to check.
 
     Returns:
-        Checks of the lateral error, the depth and the tilt; where the hole is off its paint, of what sight
-        alone leaves.
+        Checks of the lateral error, the depth and the tilt; where the hole is off its paint, of
+        what sight alone leaves.
     """
     spec = env.task.family.spec
     model = kinematics(spec.embodiment)
