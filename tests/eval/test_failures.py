@@ -1,7 +1,5 @@
 """Why policies fail: each kind of failure is told from the others."""
 
-import dataclasses
-
 import pytest
 from test_result_file import row
 
@@ -81,7 +79,6 @@ def test_mistakes_are_one_line(words, reason, tmp_path, capsys):
 def test_too_much_force_is_told_from_a_collision(force_n, cause):
     spec = hvs_suite.TASKS["insert-feel"]
     errors = {metric.name: 1.0 for metric in spec.metrics} | {"peak_force_n": force_n}
-    lost = dataclasses.replace(
-        row(0, success=False, error=1.0), collision=True, truncated=False, errors=errors
-    )
+    ended = {"collision": True, "truncated": False, "errors": errors}
+    lost = row(0, success=False, error=1.0).model_copy(update=ended)
     assert cause_of(lost, spec, 3, None, [0.1, 0.1]) is cause
