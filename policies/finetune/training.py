@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.noise import NormalActionNoise
 
+from hvs_suite.executor import worker_conditions
 from hvs_suite.policies.catalogue import name_of
 from hvs_suite.policies.checkpoints.files import read_config
 from hvs_suite.policies.checkpoints.loading import (
@@ -44,7 +45,7 @@ from hvs_suite.policies.training.budget import Budget
 from hvs_suite.policies.training.process import prepare_process
 from hvs_suite.policies.training.run_folder import claimed, write_train_config
 from hvs_suite.registry import find, options_of
-from hvs_suite.rollout import library_seeds, worker_conditions
+from hvs_suite.rollout import library_seeds
 from hvs_suite.tasks.shared.spec import Spec
 
 PACKAGES = ("hvs-suite", "mujoco", "numpy", "stable-baselines3", "torch")
