@@ -18,6 +18,7 @@ import importlib.metadata
 import logging
 import os
 import platform
+import socket
 import sys
 import time
 from collections.abc import Generator, Iterator, Mapping, Sequence
@@ -42,6 +43,7 @@ OUT_OF_TURN = 30
 sorts results has to keep them until that comes, up to half a minute after a machine fell silent."""
 LOOK_ROUND_S = 1.0
 """Time after which the cluster is looked at again, in case it has grown (s)."""
+KNOCK_S = 5.0
 # Whatever can change a physics state, a picture, or a policy's answer to it.
 PACKAGES = ("mujoco", "dm-control", "numpy", "opencv-python-headless", "pin", "ruckig", "torch")
 
@@ -106,7 +108,7 @@ class RayCluster:
                 contextlib.closing(_Crew(ray, self, make, indices, ahead, notes))
             )
             for result in crew.results():
-                if notes is not None:
+                if on_note is not None and notes is not None:
                     for words in notes.get_nowait_batch(notes.qsize()):
                         on_note(words)
                 yield from result
@@ -131,6 +133,7 @@ def join(address: str) -> Any:
         raise ClusterError("playing on Ray needs it installed: hvs-suite[ray]") from error
     if ray.is_initialized():
         return ray
+    _check_reachable(os.environ.get("RAY_ADDRESS", address) if address == "auto" else address)
     dashboard = False if address == LOCAL else None
     try:
         ray.init(
@@ -145,6 +148,24 @@ def join(address: str) -> Any:
             "(docs/many-machines.md)"
         ) from error
     return ray
+
+
+def _check_reachable(address: str) -> None:
+    """Knocks at an address, where Ray would for many minutes.
+
+    Raises:
+        ClusterError: Nobody answers.
+    """
+    if address in ("auto", LOCAL) or "://" in address:
+        return
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host, int(port)), KNOCK_S).close()
+    except (OSError, ValueError) as error:
+        raise ClusterError(
+            f"no Ray cluster answers at {address!r}: {first_line(error)}; 'ray start --head' makes "
+            "one, whose address is such as 10.0.0.1:6379 (docs/many-machines.md)"
+        ) from error
 
 
 @dataclasses.dataclass(eq=False)

@@ -287,11 +287,19 @@ def carried(make_policy: PolicyFactory) -> PolicyFactory:
     """A policy factory that needs no file of this machine.
 
     Args:
-        make_policy: If it is a `FolderFactory`, what lies in its folder travels with it, but for
-            sub-folders, where trainings keep what no policy reads.
+        make_policy: If it is a `FolderFactory`, or a dataclass around one, what lies in the folder
+            travels with it, but for sub-folders, where trainings keep what no policy reads.
     """
-    if not isinstance(make_policy, FolderFactory):
+    if not dataclasses.is_dataclass(make_policy) or isinstance(make_policy, type):
         return make_policy
+    if not isinstance(make_policy, FolderFactory):
+        inside = {
+            field.name: getattr(make_policy, field.name)
+            for field in dataclasses.fields(make_policy)
+        }
+        return dataclasses.replace(
+            make_policy, **{name: carried(each) for name, each in inside.items()}
+        )
     paths = sorted(path for path in Path(make_policy.folder).iterdir() if path.is_file())
     return _Carried(make_policy, {path.name: path.read_bytes() for path in paths})
 
