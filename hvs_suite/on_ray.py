@@ -21,7 +21,7 @@ import platform
 import socket
 import sys
 import time
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -168,6 +168,16 @@ def _check_reachable(address: str) -> None:
         ) from error
 
 
+def remote(ray: Any, kind: type) -> Callable[..., Any]:
+    """What starts actors of a class: on a core each, under the conditions of a local worker.
+
+    Args:
+        ray: As `join` returns it.
+        kind: The class.
+    """
+    return ray.remote(num_cpus=1, runtime_env={"env_vars": _environment()})(kind).remote
+
+
 @dataclasses.dataclass(eq=False)
 class _Actor:
     """An actor and what it owes.
@@ -218,7 +228,6 @@ class _Crew:
         self._next_look = 0.0
         self._horizon = 0
         self._here = installed()
-        remote = ray.remote(num_cpus=1)(_Worker)
         try:
             # Once for all; in a list, because what cannot be read there is to be told by the actor.
             job = [ray.put((make, notes))]
@@ -226,9 +235,7 @@ class _Crew:
             raise OptionError(
                 f"factories travel to other machines, and this one cannot ({first_line(error)})"
             ) from error
-        self._new = functools.partial(
-            remote.options(runtime_env={"env_vars": _environment()}).remote, job
-        )
+        self._new = functools.partial(remote(ray, _Worker), job)
 
     def results(self) -> Iterator[list[Any]]:
         """Yields lists of results, empty ones where only time has passed."""

@@ -13,7 +13,7 @@ import tempfile
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, Protocol, cast, runtime_checkable
 
 import dm_env
 import numpy as np
@@ -259,49 +259,44 @@ class _Play[T]:
 
 
 @runtime_checkable
-class FolderFactory(Protocol):
-    """A policy factory, a dataclass, that reads the files of a folder when it is called."""
+class ReadsFolder(Protocol):
+    """A factory, a dataclass, that reads the files of a folder when it is called."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
     folder: str
 
-    def __call__(self, env: Any, /) -> Policy:
-        """Builds the policy for an environment."""
+    def __call__(self, *arguments: Any) -> Any:
+        """Builds what it builds."""
 
 
 @dataclasses.dataclass(frozen=True)
 class _Carried:
-    """A `FolderFactory` with the folder's files, for machines that have no such folder."""
+    """A factory that `ReadsFolder`, with the folder's files, for machines without that folder."""
 
-    factory: FolderFactory
+    factory: ReadsFolder
     files: Mapping[str, bytes]
 
-    def __call__(self, env: Any) -> Policy:
+    def __call__(self, *arguments: Any) -> Any:
         with tempfile.TemporaryDirectory(prefix="hvs-policy-") as folder:
             for name, content in self.files.items():
                 (Path(folder) / name).write_bytes(content)
-            return dataclasses.replace(self.factory, folder=folder)(env)
+            return dataclasses.replace(self.factory, folder=folder)(*arguments)
 
 
-def carried(make_policy: PolicyFactory) -> PolicyFactory:
-    """A policy factory that needs no file of this machine.
+def carried[T](make: T) -> T:
+    """A factory that needs no file of this machine.
 
     Args:
-        make_policy: If it is a `FolderFactory`, or a dataclass around one, what lies in the folder
+        make: If it `ReadsFolder`, or is a dataclass around one that does, what lies in the folder
             travels with it, but for sub-folders, where trainings keep what no policy reads.
     """
-    if not dataclasses.is_dataclass(make_policy) or isinstance(make_policy, type):
-        return make_policy
-    if not isinstance(make_policy, FolderFactory):
-        inside = {
-            field.name: getattr(make_policy, field.name)
-            for field in dataclasses.fields(make_policy)
-        }
-        return dataclasses.replace(
-            make_policy, **{name: carried(each) for name, each in inside.items()}
-        )
-    paths = sorted(path for path in Path(make_policy.folder).iterdir() if path.is_file())
-    return _Carried(make_policy, {path.name: path.read_bytes() for path in paths})
+    if not dataclasses.is_dataclass(make) or isinstance(make, type):
+        return make
+    if not isinstance(make, ReadsFolder):
+        inside = {field.name: getattr(make, field.name) for field in dataclasses.fields(make)}
+        return dataclasses.replace(make, **{name: carried(each) for name, each in inside.items()})
+    paths = sorted(path for path in Path(make.folder).iterdir() if path.is_file())
+    return cast("T", _Carried(make, {path.name: path.read_bytes() for path in paths}))
 
 
 def _checked(action: Any, shape: Sequence[int], scenario: int, step: int) -> Action:

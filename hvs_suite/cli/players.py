@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from hvs_suite.executor import Workers
+    from hvs_suite.on_ray import RayCluster
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -45,8 +46,18 @@ def players(workers: int | None, ray: str | None, local: int) -> "Workers":
     """
     if ray is None:
         return local if workers is None else workers
+    return on_ray(ray, workers)
+
+
+def on_ray(address: str, workers: int | None) -> "RayCluster":
+    """Joins a Ray cluster, before anything else is made.
+
+    Raises:
+        OptionError: `workers` is below 1.
+        ClusterError: It cannot be joined.
+    """
     from hvs_suite.on_ray import RayCluster, join
 
-    cluster = RayCluster(ray, workers)
-    join(ray)
+    cluster = RayCluster(address, workers)
+    join(address)
     return cluster
