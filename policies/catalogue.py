@@ -19,6 +19,8 @@ BUILTIN = ("expert", "servo", "zero", "random")
 SHIPPED = ("pretrained", "finetuned")
 NAMES = (*BUILTIN, *SHIPPED)
 HERE = Path(__file__).resolve().parent
+LAST_CHECKPOINT = "checkpoints/last/pretrained_model"
+"""Where lerobot-train leaves the policy, below its output folder."""
 AS_NAMED: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -69,6 +71,8 @@ def checkpoint_folder(spec: str, task: str) -> Path:
         return folder
     # Unlike pathlib's, this is just False for a name that cannot be.
     if os.path.isdir(spec):
+        if os.path.isdir(last := os.path.join(spec, LAST_CHECKPOINT)):
+            raise PolicyError(f"{spec} is a run of lerobot-train; name its policy, {last}")
         return Path(spec)
     if hub.NAME.fullmatch(spec):
         return hub.fetch(spec)

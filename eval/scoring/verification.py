@@ -18,6 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from hvs_suite import registry, rollout
+from hvs_suite.datasets.lerobot_files import INFO
 from hvs_suite.errors import OptionError, ResultError
 from hvs_suite.eval.scoring import action_log, contender, result_file
 from hvs_suite.eval.scoring.result_file import EpisodeRow, Result
@@ -192,10 +193,11 @@ def _in_parts(
         yield logged, builtin.make_zero, False
     rest = [index for index in chosen if index >= n_logged]
     if rest:
-        yield rest, builtin_policy(path, result), True
+        player = builtin_policy(path, result)
+        yield rest, player.make, player.looks
 
 
-def builtin_policy(path: Path, result: Result) -> rollout.PolicyFactory:
+def builtin_policy(path: Path, result: Result) -> contender.Contender:
     """Returns the built-in policy that a result names.
 
     Args:
@@ -212,7 +214,7 @@ def builtin_policy(path: Path, result: Result) -> rollout.PolicyFactory:
             f"{path}: {shown(policy)!r} is no built-in policy, but the action log does not hold "
             "all scenarios; evaluate again"
         )
-    return contender.find(policy, result.summary.task).make
+    return contender.find(policy, result.summary.task)
 
 
 def check_task(path: Path, result: Result) -> None:
@@ -341,12 +343,14 @@ def results_in(paths: Sequence[Path]) -> list[Path]:
     """Returns the result files that are named or lie below the folders that are.
 
     Raises:
-        OptionError: There is none, or a path does not exist.
+        OptionError: There is none, or a path does not exist or is a dataset.
     """
     found: list[Path] = []
     for path in paths:
         if not path.exists():
             raise OptionError(f"{path} does not exist; name a result file or a folder of them")
+        if (path / INFO).exists():
+            raise OptionError(f"{path} is a dataset, no result; 'hvs check {path}' checks it")
         below = [Path(folder, name) for folder, _, names in os.walk(path) for name in names]
         found += sorted(f for f in below if f.suffix == ".json") if path.is_dir() else [path]
     if not found:

@@ -18,7 +18,7 @@ from hvs_suite.eval.scoring.comparison import Tally
 from hvs_suite.eval.scoring.result_file import Result
 from hvs_suite.eval.studies.training import SPLIT, Note, Report, train_and_judge
 from hvs_suite.executor import Workers
-from hvs_suite.policies.hvs.dataset import read_manifest
+from hvs_suite.policies.network.dataset import read_manifest
 from hvs_suite.registry import find
 
 WHOLE = "everything"

@@ -30,7 +30,7 @@ from hvs_suite.tasks.shared.option_types import listed
 from hvs_suite.tasks.shared.spec import Spec
 
 if TYPE_CHECKING:
-    from hvs_suite.policies.hvs.network import HvsNetwork
+    from hvs_suite.policies.network.network import HvsNetwork
     from hvs_suite.tasks.shared.environment import Environment
 
 # An error that falls by a fifth in so many steps is on its way to the goal.
@@ -147,7 +147,7 @@ def sort_failures(
     with contextlib.closing(registry.load(summary.task, split=summary.split, **options)) as env:
         unlogged = None
         if result.metadata.n_logged < len(result.episodes):
-            unlogged = verification.builtin_policy(path, result)(env)
+            unlogged = verification.builtin_policy(path, result).make(env)
         for row in result.episodes:
             if row.success:
                 continue

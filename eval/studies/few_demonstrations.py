@@ -21,7 +21,7 @@ from hvs_suite.eval.scoring.result_file import Result
 from hvs_suite.eval.studies.training import Note, Report, train_and_judge
 from hvs_suite.executor import Workers, check_workers, spread
 from hvs_suite.files import replacing
-from hvs_suite.policies.hvs.dataset import read_manifest
+from hvs_suite.policies.network.dataset import read_manifest
 from hvs_suite.rollout import one_torch_thread
 
 BASE = "base"

@@ -21,8 +21,10 @@ from hvs_suite.executor import Workers
 from hvs_suite.policies.finetune.folding import load_base, write_folded
 from hvs_suite.policies.finetune.settings import Settings
 from hvs_suite.policies.finetune.stage import MakeStage
-from hvs_suite.policies.hvs.dataset import GOAL_NORMAL, GOAL_POSITION, TARGET_PREFIX, Manifest
-from hvs_suite.policies.hvs.network import (
+from hvs_suite.policies.imitation.dagger import RoundSummary, play_round, read_round
+from hvs_suite.policies.imitation.demonstrations import FramePool, Recording
+from hvs_suite.policies.network.dataset import GOAL_NORMAL, GOAL_POSITION, TARGET_PREFIX, Manifest
+from hvs_suite.policies.network.network import (
     IMAGE_PREFIX,
     MEMORY,
     STATE,
@@ -31,8 +33,6 @@ from hvs_suite.policies.hvs.network import (
     sighting_loss,
     target_loss,
 )
-from hvs_suite.policies.imitation.dagger import RoundSummary, play_round, read_round
-from hvs_suite.policies.imitation.demonstrations import FramePool, Recording
 from hvs_suite.policies.rl.evaluation import Evaluation, read_evaluations, write_evaluations
 from hvs_suite.policies.rl.journal import SCENES_A_SEED
 from hvs_suite.tasks.shared.spec import Spec

@@ -22,8 +22,8 @@ from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S, after_comma
 from hvs_suite.policies.checkpoints.loading import network_inputs
 from hvs_suite.policies.finetune.folding import load_base
 from hvs_suite.policies.finetune.settings import Settings
-from hvs_suite.policies.hvs.compiled import CompiledFeatures
-from hvs_suite.policies.hvs.network import N_JOINTS
+from hvs_suite.policies.network.compiled import CompiledFeatures
+from hvs_suite.policies.network.network import N_JOINTS
 from hvs_suite.policies.rl.curriculum import Curriculum
 from hvs_suite.policies.rl.journal import OUTCOMES, Journal
 from hvs_suite.rollout import one_torch_thread

@@ -38,7 +38,7 @@ from hvs_suite.policies.finetune.overlapped import (
 from hvs_suite.policies.finetune.residual_td3 import ResidualPolicy, ResidualTD3
 from hvs_suite.policies.finetune.settings import Settings
 from hvs_suite.policies.finetune.stage import MakeStage
-from hvs_suite.policies.hvs.network import N_JOINTS, HvsNetwork
+from hvs_suite.policies.network.network import N_JOINTS, HvsNetwork
 from hvs_suite.policies.rl.curriculum import Kind, levels_of
 from hvs_suite.policies.rl.evaluation import Evaluation, Evaluator
 from hvs_suite.policies.rl.run import Outcome, Progress, Run, check_run

@@ -24,10 +24,10 @@ from hvs_suite.datasets.recorder import in_order
 from hvs_suite.errors import DatasetError, OutputError
 from hvs_suite.executor import Workers
 from hvs_suite.policies.checkpoints.loading import CheckpointFactory
-from hvs_suite.policies.hvs.dataset import Manifest
-from hvs_suite.policies.hvs.network import IMAGE_PREFIX
 from hvs_suite.policies.imitation.demonstrations import Recording
 from hvs_suite.policies.imitation.frame_cache import new_frames, open_frames
+from hvs_suite.policies.network.dataset import Manifest
+from hvs_suite.policies.network.network import IMAGE_PREFIX
 from hvs_suite.reading import decode_png
 from hvs_suite.rollout import Policy, play, tell
 

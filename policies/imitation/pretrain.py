@@ -20,7 +20,6 @@ import torch
 from hvs_suite.errors import PolicyError
 from hvs_suite.executor import Workers, check_workers
 from hvs_suite.files import replacing
-from hvs_suite.policies.hvs.dataset import Manifest, read_manifest, refuse_test_split
 from hvs_suite.policies.imitation.dagger import RoundSummary, play_round, read_round, round_shares
 from hvs_suite.policies.imitation.demonstrations import Demonstrations
 from hvs_suite.policies.imitation.settings import (
@@ -30,6 +29,7 @@ from hvs_suite.policies.imitation.settings import (
     take_eyes,
 )
 from hvs_suite.policies.imitation.state import Counters, load_state, save_state
+from hvs_suite.policies.network.dataset import Manifest, read_manifest, refuse_test_split
 from hvs_suite.policies.training.budget import Budget
 from hvs_suite.policies.training.curves import Curves
 from hvs_suite.policies.training.plot import draw_run

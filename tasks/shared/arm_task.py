@@ -512,8 +512,9 @@ class ArmTask(composer.Task):
             return self.cameras[camera].id
         view = mujoco.MjvCamera()
         view.type = mujoco.mjtCamera.mjCAMERA_FREE.value
-        view.lookat[:] = [0.0, 0.0, 0.48]
-        view.distance, view.azimuth, view.elevation = 2.15, 145.0, -22.0
+        # Far enough for a stretched arm, whichever way it points.
+        view.lookat[:] = [0.0, 0.0, 0.44]
+        view.distance, view.azimuth, view.elevation = 2.6, 145.0, -22.0
         return view
 
     def _is_occluded(

@@ -32,7 +32,7 @@ from hvs_suite.cell.renderer import Renderer
 from hvs_suite.cell.solid import Solid
 from hvs_suite.errors import ScenarioError
 from hvs_suite.tasks.shared.arm_task import ArmTask
-from hvs_suite.tasks.shared.goal import Goal
+from hvs_suite.tasks.shared.goal import Goal, Tip
 from hvs_suite.tasks.shared.scenario import Scenario
 from hvs_suite.tasks.shared.spec import Spec
 
@@ -261,6 +261,10 @@ class Environment(composer.Environment):
     def goal(self, ahead_s: float = 0.0) -> Goal:
         """Where the tool's tip has to be now, or some time from now (s)."""
         return self._arm.goal(ahead_s)
+
+    def tip(self) -> Tip:
+        """Where the tool's tip is now."""
+        return self._arm.tip(self._physics_proxy)
 
     @property
     def distance_m(self) -> float:
