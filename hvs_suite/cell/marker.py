@@ -31,16 +31,19 @@ _FIDUCIAL_PX = 256
 class Marker(composer.Entity):
     """The target that the tool has to be placed over; its origin lies on the surface, z outward."""
 
-    def _build(self, kind: MarkerKind = "disc", diameter_m: float = 0.05) -> None:
+    def _build(
+        self, kind: MarkerKind = "disc", diameter_m: float = 0.05, name: str = "marker"
+    ) -> None:
         """Builds the marker.
 
         Args:
             kind: ``disc``, ``ring`` (outer diameter as given, hole half of it) or ``fiducial`` (an
                 ArUco 4x4 marker whose sides are the diameter).
             diameter_m: Diameter or side length (m).
+            name: Of the marker, unique in the cell.
         """
         self.diameter_m = diameter_m
-        self._root = mjcf.RootElement(model="marker")
+        self._root = mjcf.RootElement(model=name)
         common: dict[str, Any] = {"contype": 0, "conaffinity": 0, "mass": 0, "group": 1}
         radius = diameter_m / 2
         top = 2 * HALF_THICKNESS_M
