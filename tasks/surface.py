@@ -111,10 +111,9 @@ class SurfaceSpec(PlacingSpec):
         shape = "plate"
         if self.radius_m is not None:
             low, high = self.radius_m
-            shape = f"skin of {low:g}-{high:g} m radius" + (" with seams" if self.seams else "")
-        leaning = f"tilted up to {self.tilt_deg[1]:g} deg, raised up to {1e3 * self.raise_m[1]:g} mm"
+            shape = f"skin of {low:g}-{high:g} m radius"
         return dataclasses.replace(
-            words, target=f"{words.target} in {self.n_marks} marks on a {shape}, {leaning}"
+            words, target=f"{words.target} in {self.n_marks} marks, on a {shape} at any slope"
         )
 
 
@@ -289,6 +288,10 @@ _FUSELAGE = dataclasses.replace(
     _TILTED,
     name="surface-fuselage",
     radius_m=(1.5, 3.0),
+    n_marks=8,
+    target_diameter_m=0.016,
+    mark_diameter_m=0.003,
+    mark_ring_m=0.016,
     position_tolerance_mm=0.5,
     tilt_tolerance_deg=0.5,
 )
@@ -299,9 +302,12 @@ _HARD = dataclasses.replace(
     position_tolerance_mm=0.25,
     hold_steps=5,
     time_limit_steps=60,
-    mark_ring_m=0.020,
+    n_marks=6,
+    target_diameter_m=0.014,
+    mark_diameter_m=0.0025,
+    mark_ring_m=0.012,
     seams=True,
-    **HARD,
+    **{**HARD, "eth_resolution": 448},
 )
 
 register(Surface, _TILTED, _FUSELAGE, _HARD)
