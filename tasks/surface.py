@@ -47,6 +47,8 @@ OFF_CENTRE_M = 0.05
 """How far from the middle of its panel a target may lie, along either side (m)."""
 N_PANELS = 16
 """Curved panels in the model, evenly spaced in curvature; a scene sets up one of them."""
+MARK_HALF_THICKNESS_M = 0.00004
+"""Of the marks (m): on thicker ones the eye would see the sides as well."""
 MAX_TILT_DEG = 20.0
 MAX_RAISE_M = 0.15
 
@@ -152,7 +154,11 @@ class Surface(Placing[SurfaceSpec, SurfaceScenario]):
         super().build(cell)
         spec = self.spec
         self._marks = [
-            Marker(diameter_m=spec.mark_diameter_m, name=f"mark-{number}")
+            Marker(
+                diameter_m=spec.mark_diameter_m,
+                name=f"mark-{number}",
+                half_thickness_m=MARK_HALF_THICKNESS_M,
+            )
             for number in range(spec.n_marks)
         ]
         for mark in self._marks:

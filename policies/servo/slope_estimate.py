@@ -11,7 +11,6 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from hvs_suite.cell.marker import HALF_THICKNESS_M
 from hvs_suite.tasks.shared.detection import Disc
 from hvs_suite.tasks.shared.pattern_pose import Look, Ring, RingFit, RingPose, axes, fit, match
 
@@ -25,6 +24,8 @@ _SIZE_SHARE = 0.06
 _OUTLIER_M = 0.05
 _MAX_OUTLIERS = 3
 _MAX_LOOKS = 40
+_MAX_MISSES = 4.0
+"""Root mean square of a fit's misses, in their standard deviations, that is believed."""
 
 
 class SlopeEstimate:
@@ -72,21 +73,21 @@ class SlopeEstimate:
             self._see_target(discs, K, T)
         if self.place is None:
             return
-        look = None
-        if self.fit is not None:
-            look = match(discs, self._ring, self.fit.pose, K, T)
-        elif len(discs) > self._ring.n_marks:
-            guess = self._first_guess(discs, K, T)
-            look = guess and match(discs, self._ring, guess, K, T)
-            if guess is not None and look is not None:
-                if len(look.marks) < self._ring.n_marks:
-                    return
-                self.fit = RingFit(guess, np.full(6, np.inf))
-        if look is None or self.fit is None:
+        guess = self._first_guess(discs, K, T) if self.fit is None else self.fit.pose
+        look = guess and match(discs, self._ring, guess, K, T)
+        # All marks have to be told apart at first; later any look will do.
+        if guess is None or look is None:
             return
-        self._looks = [*self._looks, look][-_MAX_LOOKS:]
-        self.fit = fit(self._looks, self._ring, self.fit.pose, K)
-        self.place = self.fit.pose.target - 2.0 * HALF_THICKNESS_M * self.fit.pose.normal
+        if self.fit is None and len(look.marks) < self._ring.n_marks:
+            return
+        looks = [*self._looks, look][-_MAX_LOOKS:]
+        found = fit(looks, self._ring, guess, K)
+        if found.misses > _MAX_MISSES:
+            # Something else was taken for a mark, now or before.
+            self._looks, self.fit = [], None
+            return
+        self._looks, self.fit = looks, found
+        self.place = found.pose.target
 
     def _see_target(self, discs: Sequence[Disc], K: FloatArray, T: FloatArray) -> None:
         """Take the largest patch that is not cut for the target, where its size can be right."""
@@ -133,6 +134,8 @@ class SlopeEstimate:
         """A level ring, turned like the patches around the target."""
         assert self.place is not None
         n = self._ring.n_marks
+        if len(discs) <= n:
+            return None
         optical = T[:3, :3] @ self.place + T[:3, 3]
         if optical[2] <= 0.02:
             return None

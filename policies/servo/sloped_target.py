@@ -140,10 +140,7 @@ class SlopedTargetServo(StillTargetServo):
         left = spec.time_limit_steps - self._steps
         is_late = left <= spec.hold_steps + _STEPS_TO_GOAL
         if not self._is_going:
-            is_sure = bool((fit.sigmas[:5] <= self._sure).all())
-            self._is_going = is_late or (is_sure and self._n_sides >= _N_SIDES // 2) or (
-                is_sure and bool((fit.sigmas[:5] <= 0.5 * self._sure).all())
-            )
+            self._is_going = is_late or bool((fit.sigmas[:5] <= self._sure).all())
             self._waited = 0
             return
         R, p = kinematics().flange_pose(q)

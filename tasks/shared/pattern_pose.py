@@ -77,10 +77,13 @@ class RingFit:
         pose: The pose.
         sigmas: Standard deviations of the fit: of the place in the base frame (m), three, of the
             slope about two axes along the surface (rad), and of the turn (rad), (6,).
+        misses: Root mean square of the distances from where marks were seen, in their standard
+            deviations.
     """
 
     pose: RingPose
     sigmas: FloatArray
+    misses: float
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -165,7 +168,8 @@ def fit(looks: Sequence[Look], ring: Ring, start: RingPose, K: FloatArray) -> Ri
     )
     covariance = np.linalg.pinv(found.jac.T @ found.jac)
     scale = np.array([1e-3, 1e-3, 1e-3, 1.0, 1.0, 1.0])
-    return RingFit(moved(found.x), scale * np.sqrt(np.diag(covariance)))
+    misses = float(np.sqrt(np.mean(found.fun**2)))
+    return RingFit(moved(found.x), scale * np.sqrt(np.diag(covariance)), misses)
 
 
 def axes(normal: FloatArray) -> FloatArray:
