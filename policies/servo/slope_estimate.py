@@ -24,6 +24,8 @@ _SIZE_SHARE = 0.06
 _OUTLIER_M = 0.05
 _MAX_OUTLIERS = 3
 _MAX_LOOKS = 40
+_MAX_LOST = 4
+"""In how many pictures on end the marks may not be where they have to be."""
 _MAX_MISSES = 4.0
 """Root mean square of a fit's misses, in their standard deviations, that is believed."""
 
@@ -44,7 +46,7 @@ class SlopeEstimate:
         self._rays: list[tuple[FloatArray, FloatArray]] = []
         self._looks: list[Look] = []
         self._eth: tuple[FloatArray, FloatArray] | None = None
-        self._outliers = 0
+        self._outliers = self._n_lost = 0
         self.place: FloatArray | None = None
         """Of the target, (3,) m; None before any camera has seen it."""
         self.fit: RingFit | None = None
@@ -77,6 +79,9 @@ class SlopeEstimate:
         look = guess and match(discs, self._ring, guess, K, T)
         # All marks have to be told apart at first; later any look will do.
         if guess is None or look is None:
+            self._n_lost += 1
+            if self._n_lost > _MAX_LOST:
+                self._forget_marks()
             return
         if self.fit is None and len(look.marks) < self._ring.n_marks:
             return
@@ -84,10 +89,15 @@ class SlopeEstimate:
         found = fit(looks, self._ring, guess, K)
         if found.misses > _MAX_MISSES:
             # Something else was taken for a mark, now or before.
-            self._looks, self.fit = [], None
+            self._forget_marks()
             return
-        self._looks, self.fit = looks, found
+        self._looks, self.fit, self._n_lost = looks, found, 0
         self.place = found.pose.target
+
+    def _forget_marks(self) -> None:
+        """Begin again with the place of the target alone."""
+        self._looks, self.fit, self._n_lost = [], None, 0
+        self._rays = self._rays[-1:]
 
     def _see_target(self, discs: Sequence[Disc], K: FloatArray, T: FloatArray) -> None:
         """Take the largest patch that is not cut for the target, where its size can be right."""

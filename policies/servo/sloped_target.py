@@ -34,14 +34,14 @@ _HOVER_M = 0.22
 """How far above the target the flange hovers until the eye in the hand sees it (m)."""
 _NEAR_RINGS = 8.0
 """From how near the marks can be told apart for certain, in radii of their ring."""
-_LEAN_RAD = math.radians(25.0)
-_FARTHER_M = 0.025
+_LEAN_RAD = math.radians(35.0)
+_FARTHER_M = 0.005
 """How much farther than the goal the eye is when it looks from the side (m)."""
 _N_SIDES = 10
 _SURE_SHARE = 0.25
 """The standard deviation that is good enough, in tolerances."""
 _THERE_M, _THERE_COS = 0.012, math.cos(math.radians(8.0))
-_STEPS_TO_GOAL = 6
+_STEPS_TO_GOAL = 7
 _PATIENCE = 3
 _DEPTH_M = 0.20
 
@@ -123,7 +123,7 @@ class SlopedTargetServo(StillTargetServo):
             hover = np.array([*slope.place[:2], self._highest_m + _HOVER_M])
             return self._over(within_reach(hover)), None
         if slope.fit is None:
-            near = max(_NEAR_RINGS * self._ring.radius_m, 2.0 * self._variant.standoff_m)
+            near = max(_NEAR_RINGS * self._ring.radius_m, 1.5 * self._variant.standoff_m)
             return Goal(slope.place, _UP, near * (1.0 + 0.3 * self._misses)), None
         normal = slope.fit.pose.normal
         self._planner.avoid((_around(slope.place, normal),))
