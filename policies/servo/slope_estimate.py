@@ -79,7 +79,8 @@ class SlopeEstimate:
         look = guess and match(discs, self._ring, guess, K, T)
         # All marks have to be told apart at first; later any look will do.
         if guess is None or look is None:
-            self._n_lost += 1
+            # The target itself is in view, and where its marks have to be there are none.
+            self._n_lost += self.fit is not None and bool(discs) and not discs[0].is_cut
             if self._n_lost > _MAX_LOST:
                 self._forget_marks()
             return

@@ -17,7 +17,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from hvs_suite.cell.kinematics import kinematics
+from hvs_suite.cell.kinematics import away_from_stops, kinematics
+from hvs_suite.cell.robot import JOINT_ACCELERATION_RAD_S2
 from hvs_suite.cell.solid import Solid
 from hvs_suite.policies.servo.slope_estimate import SlopeEstimate
 from hvs_suite.policies.servo.still_target import StillTargetServo, facing_down, within_reach
@@ -38,6 +39,8 @@ _LEAN_RAD = math.radians(35.0)
 _FARTHER_M = 0.005
 """How much farther than the goal the eye is when it looks from the side (m)."""
 _N_SIDES = 10
+_DETOUR_RAD = 1.2
+"""A joint turns farther than this only where the arm has to take another shape."""
 _SURE_SHARE = 0.25
 """The standard deviation that is good enough, in tolerances."""
 _THERE_M, _THERE_COS = 0.012, math.cos(math.radians(8.0))
@@ -83,6 +86,7 @@ class SlopedTargetServo(StillTargetServo):
         self._slope = SlopeEstimate(self._ring, spec.target_diameter_m, (0.0, self._highest_m))
         self._side: float | None = None
         self._n_sides = 0
+        self._turning = 1.0
         self._is_going = False
         self._waited = 0
 
@@ -152,7 +156,10 @@ class SlopedTargetServo(StillTargetServo):
             self._sure = 0.7 * self._sure
 
     def _from_the_side(self, q: FloatArray, place: FloatArray, normal: FloatArray) -> Goal:
-        """The next place on the circle around the target from which to look at it."""
+        """The next place on the circle around the target from which to look at it.
+
+        Where the arm cannot go on around without a detour, it turns back.
+        """
         R, p = kinematics().flange_pose(q)
         x, y = axes(normal)
         if self._side is None:
@@ -163,17 +170,26 @@ class SlopedTargetServo(StillTargetServo):
             towards = math.cos(_LEAN_RAD) * normal + math.sin(_LEAN_RAD) * lean
             look = Goal(place, towards, self._variant.standoff_m + _FARTHER_M)
             there = np.linalg.norm(p - look.position) < _THERE_M and -R[:, 2] @ towards > _THERE_COS
-            if not there and self._is_reachable(look):
+            is_near = self._is_near(q, look, Goal(place, normal, self._variant.standoff_m))
+            if is_near and not there:
                 break
-            self._side += 2.0 * math.pi / _N_SIDES
+            if not is_near:
+                self._turning = -self._turning
+            self._side += self._turning * 2.0 * math.pi / _N_SIDES
             self._n_sides += 1
         return look
 
-    def _is_reachable(self, goal: Goal) -> bool:
-        found = self._kinematics.goal_configurations_at_tool_angle(
-            goal.position, goal.normal, 0.0, 12
-        )
-        return bool(len(found))
+    def _is_near(self, q: FloatArray, look: Goal, goal: Goal) -> bool:
+        """Whether a short motion leads to where to look from, and another one to the goal."""
+        here = away_from_stops(q)
+        for there in (look, goal):
+            near = self._kinematics.nearest_configuration(
+                here, there.position, there.normal, JOINT_ACCELERATION_RAD_S2
+            )
+            if near is None or np.abs(near - here).max() > _DETOUR_RAD:
+                return False
+            here = near
+        return True
 
     def _over(self, position: FloatArray) -> Goal:
         """The goal of the flange at a place (3,) m, above all panels."""
