@@ -107,6 +107,17 @@ class SurfaceSpec(PlacingSpec):
         if 2.0 * self.mark_ring_m * math.sin(math.pi / self.n_marks) <= self.mark_diameter_m:
             raise OptionError(f"n_marks is {self.n_marks}: so many overlap; use fewer, or smaller")
 
+    @property
+    def sag_m(self) -> float:
+        """How far the marks lie below the plane that touches the skin at the target (m).
+
+        On the average over the ring and over the radii: they do so across the cylinder's axis, by
+        r^2 / 2R, and not at all along it.
+        """
+        if self.radius_m is None:
+            return 0.0
+        return 0.25 * self.mark_ring_m**2 * 0.5 * sum(1.0 / radius for radius in self.radius_m)
+
     def describe(self) -> Description:
         """The task in words."""
         words = super().describe()
@@ -285,6 +296,21 @@ class Surface(Placing[SurfaceSpec, SurfaceScenario]):
     def obstacles(self) -> "tuple[Solid, ...]":
         """The panel and its post."""
         return self._solids
+
+    @classmethod
+    def certify(cls, env: "Environment", scenarios: Iterable[int]) -> list["Check"]:
+        """Reachable, in time and observable; slope and place told well enough by the marks."""
+        from hvs_suite.tasks.shared import certificate
+        from hvs_suite.tasks.shared.certificate_slope import check_slope
+        from hvs_suite.tasks.shared.pattern_pose import Ring
+
+        spec = env.task.family.spec
+        ring = Ring(spec.mark_ring_m, spec.n_marks, spec.sag_m)
+        return [
+            *certificate.check_geometry(env, scenarios),
+            *certificate.check_visibility(env, scenarios),
+            *check_slope(env, scenarios, ring),
+        ]
 
 
 _TILTED = SurfaceSpec(

@@ -62,11 +62,7 @@ class SlopedTargetServo(StillTargetServo):
     def __init__(self, spec: SurfaceSpec) -> None:
         lean = math.sin(math.radians(spec.tilt_deg[1]))
         self._highest_m = spec.raise_m[1] + SIDE_M * lean + 0.02
-        curvature = 0.0
-        if spec.radius_m is not None:
-            curvature = 0.5 * (1.0 / spec.radius_m[0] + 1.0 / spec.radius_m[1])
-        # On the average over the directions: along the axis of a cylinder there is no sag.
-        self._ring = Ring(spec.mark_ring_m, spec.n_marks, 0.25 * curvature * spec.mark_ring_m**2)
+        self._ring = Ring(spec.mark_ring_m, spec.n_marks, spec.sag_m)
         tolerance_mm = spec.position_tolerance_mm or spec.lateral_tolerance_mm or 1.0
         self._sure = _SURE_SHARE * np.array(
             [1e-3 * tolerance_mm] * 3 + [math.radians(spec.tilt_tolerance_deg)] * 2
