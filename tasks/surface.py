@@ -335,11 +335,12 @@ _HARD = dataclasses.replace(
     hold_steps=5,
     time_limit_steps=60,
     n_marks=6,
-    target_diameter_m=0.014,
-    mark_diameter_m=0.0025,
-    mark_ring_m=0.012,
+    target_diameter_m=0.011,
+    mark_diameter_m=0.0017,
+    mark_ring_m=0.0085,
     seams=True,
-    **{**HARD, "eth_resolution": 448},
+    # Small enough that the slope needs many looks, from the side; and to be seen from afar at all:
+    **{**HARD, "eth_resolution": 512},
 )
 
 register(Surface, _TILTED, _FUSELAGE, _HARD)

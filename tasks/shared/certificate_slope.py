@@ -19,10 +19,9 @@ if TYPE_CHECKING:
 
 FloatArray = npt.NDArray[np.float64]
 
-N_LOOKS = 48
 LEAN_DEG = 35.0
 FARTHER_M = 0.005
-"""The reference looks so often, from so far to the side, so much farther than the goal."""
+"""The reference looks from so far to the side, so much farther than the goal."""
 PERCENTILE = 95
 _TURN_RAD = 2.4
 _TURN_RANGE_RAD = 2.5
@@ -62,12 +61,13 @@ def check_slope(env: "Environment", scenarios: Iterable[int], ring: Ring) -> lis
     bounds = spec.step_bounds
     found = np.percentile(np.array(rows), PERCENTILE, axis=0)
     metrics = {metric.name: metric for metric in spec.metrics}
+    needed = spec.time_limit_steps // 4
     checks = [
         Check(
-            f"observable: looks at the marks, of {N_LOOKS + 1} from the goal and from around it",
+            f"observable: looks that show the marks, of {spec.time_limit_steps} all around the goal",
             f"mean {np.mean(numbers):.1f}, min {min(numbers)}",
-            f">= {N_LOOKS // 4}",
-            min(numbers) >= N_LOOKS // 4,
+            f">= {needed}",
+            min(numbers) >= needed,
         )
     ]
     for name, value in zip(names, found, strict=True):
@@ -107,7 +107,7 @@ def _looks(env: "Environment", ring: Ring) -> tuple[list[Look], RingPose]:
     # A posture from which one can look from most sides, of those that are soon reached.
     best: list[FloatArray] = []
     for q in family[np.argsort(times)[:: max(1, len(family) // 12)]]:
-        around = [near for view in _views(goal) if (near := _near(q, view)) is not None]
+        around = [near for view in _views(goal, env.spec.time_limit_steps) if (near := _near(q, view)) is not None]
         best = max(best, around, key=len)
     looks = []
     for number, q in enumerate(best):
@@ -125,11 +125,11 @@ def _looks(env: "Environment", ring: Ring) -> tuple[list[Look], RingPose]:
     return looks, pose
 
 
-def _views(goal: Goal) -> list[Goal]:
+def _views(goal: Goal, count: int) -> list[Goal]:
     """The goal itself, and places around it from which to look at its target."""
     x, y = axes(goal.normal)
     lean, views = math.radians(LEAN_DEG), [goal]
-    for around in 2.0 * math.pi * np.arange(N_LOOKS) / N_LOOKS:
+    for around in 2.0 * math.pi * np.arange(1, count) / count:
         side = math.cos(around) * x + math.sin(around) * y
         towards = math.cos(lean) * goal.normal + math.sin(lean) * side
         views.append(Goal(goal.target, towards, goal.standoff_m + FARTHER_M))
