@@ -237,7 +237,7 @@ class Surface(Placing[SurfaceSpec, SurfaceScenario]):
         goal = Goal(points[0] + position, normals[0], spec.standoff_m)
         own = self.named.start if self.named is not None else "zero"
         rotation_vector = turn.as_rotvec()
-        solids = (panel.solid(position, tuple(rotation_vector.tolist())),)
+        solids = (panel.solid(position, rotation_vector),)
         return SurfaceScenario(
             target=goal.target,
             normal=goal.normal,
@@ -262,7 +262,8 @@ class Surface(Placing[SurfaceSpec, SurfaceScenario]):
         """Look up target, marks and panels in the compiled model."""
         super().after_compile(physics)
         model = physics.model
-        geoms = [int(physics.bind(each.geom).element_id) for each in (*self._marks, *self._panels)]
+        things = [each.geom for each in self._marks] + [each.geom for each in self._panels]
+        geoms = [int(physics.bind(geom).element_id) for geom in things]
         rows = [int(model.body_mocapid[model.geom_bodyid[geom]]) for geom in geoms]
         n = len(self._marks)
         self._mark_rows, self._panel_rows, self._panel_geoms = rows[:n], rows[n:], geoms[n:]
@@ -285,8 +286,8 @@ class Surface(Placing[SurfaceSpec, SurfaceScenario]):
         data.mocap_pos[self._mark_rows] = scenario.marks
         data.mocap_quat[self._mark_rows] = [orientation(n) for n in scenario.mark_normals]
         self._goal = Goal(scenario.target, scenario.normal, self.spec.standoff_m)
-        panel, x, y, z = self._panels[scenario.panel], *scenario.panel_turn.tolist()
-        self._solids = (panel.solid(scenario.panel_position, (x, y, z)),)
+        panel = self._panels[scenario.panel]
+        self._solids = (panel.solid(scenario.panel_position, scenario.panel_turn),)
         self.put_marker(physics, self._goal)
 
     def goal(self, ahead_s: float = 0.0) -> Goal:
@@ -313,9 +314,7 @@ class Surface(Placing[SurfaceSpec, SurfaceScenario]):
         ]
 
 
-_TILTED = SurfaceSpec(
-    name="surface-tilted", hold_steps=3, time_limit_steps=40, eth_resolution=336
-)
+_TILTED = SurfaceSpec(name="surface-tilted", hold_steps=3, time_limit_steps=40, eth_resolution=336)
 _FUSELAGE = dataclasses.replace(
     _TILTED,
     name="surface-fuselage",

@@ -4,6 +4,7 @@ A piece of skin is the top of a cylinder; its axis is parallel to the panel's ow
 origin lies in the middle of the skin, x and y along it and z outward.
 """
 
+import dataclasses
 import math
 
 import cv2
@@ -15,7 +16,7 @@ from dm_control import mjcf
 
 from hvs_suite.cell.prop import Prop
 from hvs_suite.cell.robot import SCENE_BIT
-from hvs_suite.cell.solid import Place, Solid
+from hvs_suite.cell.solid import Solid
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -93,18 +94,19 @@ class Panel(Prop):
         half = 0.5 * self.side_m
         return np.array([(x, y, self.bottom_m) for x in (-half, half) for y in (-half, half)])
 
-    def solid(self, position: FloatArray, rotation_vector: Place) -> Solid:
+    def solid(self, position: FloatArray, rotation_vector: FloatArray) -> Solid:
         """A box that holds panel and post, below the plane that touches the skin in the middle.
 
         Args:
             position: Of the panel's frame, (3,) m.
-            rotation_vector: Its turn (rad).
+            rotation_vector: Its turn, (3,) rad.
         """
         depth = POST_LENGTH_M - self.bottom_m
         half = (0.5 * self.side_m, 0.5 * self.side_m, 0.5 * depth)
-        upright = Solid("box", half, lean=rotation_vector)
-        x, y, z = (position - 0.5 * depth * upright.rotation[:, 2]).tolist()
-        return Solid("box", half, (x, y, z), lean=rotation_vector, is_faced=True)
+        a, b, c = rotation_vector.tolist()
+        middle = Solid("box", half, lean=(a, b, c), is_faced=True)
+        x, y, z = (position - 0.5 * depth * middle.rotation[:, 2]).tolist()
+        return dataclasses.replace(middle, centre=(x, y, z))
 
     def _mesh(self) -> trimesh.Trimesh:
         half = 0.5 * self.side_m
@@ -133,25 +135,31 @@ def _skin(key: int, side_m: float) -> npt.NDArray[np.uint8]:
         grey += random.uniform(-30.0, 10.0) * np.exp(-(away**2))
     grey = cv2.GaussianBlur(grey + random.normal(0.0, 6.0, grey.shape), (0, 0), 1.2)
     picture = np.clip(grey, 0.0, 255.0).astype(np.uint8)
-    for _ in range(2):
-        # Across, and once more across what has been turned over.
+    for is_riveted in (False, True):
+        # Across, and once more across what has been turned over; rows of rivets do not cross.
         picture = np.ascontiguousarray(picture.T)
         for place in random.uniform(0.15, 0.85, 2) * _TEXTURE_PX:
-            _draw_seam(picture, place, scale, random)
+            _draw_seam(picture, place)
+            if is_riveted:
+                _draw_rivets(picture, place, scale, random)
     return np.repeat(picture[..., None], 3, axis=2)
 
 
-def _draw_seam(
+def _draw_seam(canvas: npt.NDArray[np.uint8], place_px: float) -> None:
+    """Draw a seam across the whole picture (H, W)."""
+    end, row = canvas.shape[0], round(place_px)
+    cv2.line(canvas, (0, row), (end, row), 95.0, 2, cv2.LINE_AA)
+    cv2.line(canvas, (0, row + 2), (end, row + 2), 250.0, 1, cv2.LINE_AA)
+
+
+def _draw_rivets(
     canvas: npt.NDArray[np.uint8], place_px: float, scale: float, random: np.random.Generator
 ) -> None:
-    """Draw a seam across the whole picture (H, W), and a row of rivets beside it."""
-    end = canvas.shape[0]
-    cv2.line(canvas, (0, round(place_px)), (end, round(place_px)), 95.0, 2, cv2.LINE_AA)
-    cv2.line(canvas, (0, round(place_px) + 2), (end, round(place_px) + 2), 250.0, 1, cv2.LINE_AA)
+    """Draw a row of rivets beside a seam."""
     row = round(place_px + random.choice([-1.0, 1.0]) * 0.010 * scale)
     radius = round(_RIVET_RADIUS_M * scale)
     first = random.uniform(0.0, _RIVET_PITCH_M) * scale
-    for along in np.arange(first, end, _RIVET_PITCH_M * scale):
+    for along in np.arange(first, canvas.shape[0], _RIVET_PITCH_M * scale):
         centre = (round(along), row)
         cv2.circle(canvas, centre, radius, 130.0, 2, cv2.LINE_AA)
         cv2.circle(canvas, centre, radius - 2, 215.0, -1, cv2.LINE_AA)

@@ -63,7 +63,7 @@ class SlopeEstimate:
         return len(self._looks)
 
     def see_eth(self, disc: Disc, K: FloatArray, T: FloatArray, sigma_m: float) -> None:
-        """Take in a patch in the picture of the eye to hand, whose calibration is off by so much."""
+        """Take in a patch in the eye to hand's picture; its calibration has that deviation."""
         direction = _ray(disc.centre, K, T)
         weight = (np.eye(3) - np.outer(direction, direction)) / sigma_m**2
         self._eth = weight, weight @ _eye(T)
@@ -76,7 +76,7 @@ class SlopeEstimate:
         if self.place is None:
             return
         guess = self._first_guess(discs, K, T) if self.fit is None else self.fit.pose
-        look = guess and match(discs, self._ring, guess, K, T)
+        look = match(discs, self._ring, guess, K, T) if guess is not None else None
         # All marks have to be told apart at first; later any look will do.
         if guess is None or look is None:
             # The target itself is in view, and where its marks have to be there are none.
@@ -134,14 +134,12 @@ class SlopeEstimate:
         low, high = self._height_m
         information = np.diag([1e-6, 1e-6, (0.5 * (high - low)) ** -2])
         weighted = information @ [0.0, 0.0, 0.5 * (low + high)]
-        seen = self._rays if self._rays or self._eth is None else [self._eth]
+        seen = [self._eth] if self._eth is not None and not self._rays else self._rays
         for matrix, vector in seen:
             information, weighted = information + matrix, weighted + vector
         self.place = np.linalg.solve(information, weighted)
 
-    def _first_guess(
-        self, discs: Sequence[Disc], K: FloatArray, T: FloatArray
-    ) -> RingPose | None:
+    def _first_guess(self, discs: Sequence[Disc], K: FloatArray, T: FloatArray) -> RingPose | None:
         """A level ring, turned like the patches around the target."""
         assert self.place is not None
         n = self._ring.n_marks

@@ -17,11 +17,11 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from hvs_suite.cell.kinematics import away_from_stops, kinematics
+from hvs_suite.cell.kinematics import away_from_stops
 from hvs_suite.cell.robot import JOINT_ACCELERATION_RAD_S2
 from hvs_suite.cell.solid import Solid
 from hvs_suite.policies.servo.slope_estimate import SlopeEstimate
-from hvs_suite.policies.servo.still_target import StillTargetServo, facing_down, within_reach
+from hvs_suite.policies.servo.still_target import StillTargetServo, within_reach
 from hvs_suite.rollout import Observation
 from hvs_suite.tasks.shared.detection import find_discs
 from hvs_suite.tasks.shared.goal import Goal
@@ -98,7 +98,7 @@ class SlopedTargetServo(StillTargetServo):
             self._slope.see_eih(discs, self._eih_K, T)
             if discs or (self._slope.n_looks, self._slope.is_seen_closely) != before:
                 self._misses = 0
-            elif self._slope.place is not None and self._should_see(T):
+            elif self._slope.place is not None and self._should_see(T, self._slope.place):
                 self._misses += 1
                 if self._misses > self.max_misses:
                     self._start_over()
@@ -108,9 +108,9 @@ class SlopedTargetServo(StillTargetServo):
         if self._slope.place is None:
             self._rule_out(q, T)
 
-    def _should_see(self, T: FloatArray) -> bool:
-        """Whether the target is in the eye in the hand's view."""
-        x, y, depth = T[:3, :3] @ self._slope.place + T[:3, 3]
+    def _should_see(self, T: FloatArray, place: FloatArray) -> bool:
+        """Whether a target at a place (3,) is in the eye in the hand's view, extrinsics (4, 4)."""
+        x, y, depth = T[:3, :3] @ place + T[:3, 3]
         return bool(depth > 0.02 and max(abs(x), abs(y)) <= self._half_view * depth)
 
     def _aim(self, q: FloatArray) -> tuple[Goal, Goal | None]:
@@ -143,7 +143,7 @@ class SlopedTargetServo(StillTargetServo):
             self._is_going = is_late or bool((fit.sigmas[:5] <= self._sure).all())
             self._waited = 0
             return
-        R, p = kinematics().flange_pose(q)
+        _, p = self._kinematics.flange_pose(q)
         if np.linalg.norm(p - goal.position) < 0.001:
             self._waited += 1
         if self._waited > spec.hold_steps + _PATIENCE and not is_late:
@@ -156,7 +156,7 @@ class SlopedTargetServo(StillTargetServo):
 
         Where the arm cannot go on around without a detour, it turns back.
         """
-        R, p = kinematics().flange_pose(q)
+        R, p = self._kinematics.flange_pose(q)
         x, y = axes(normal)
         if self._side is None:
             away = p - place

@@ -23,6 +23,8 @@ LEAN_DEG = 35.0
 FARTHER_M = 0.005
 """The reference looks from so far to the side, so much farther than the goal."""
 PERCENTILE = 95
+_POSTURES = 12
+"""At the goal, of which the one is taken from which most looks are a short way."""
 _TURN_RAD = 2.4
 _TURN_RANGE_RAD = 2.5
 _MISTAKEN = 0.02
@@ -64,7 +66,7 @@ def check_slope(env: "Environment", scenarios: Iterable[int], ring: Ring) -> lis
     needed = spec.time_limit_steps // 4
     checks = [
         Check(
-            f"observable: looks that show the marks, of {spec.time_limit_steps} all around the goal",
+            f"observable: looks that show the marks, of {spec.time_limit_steps} around the goal",
             f"mean {np.mean(numbers):.1f}, min {min(numbers)}",
             f">= {needed}",
             min(numbers) >= needed,
@@ -107,7 +109,11 @@ def _looks(env: "Environment", ring: Ring) -> tuple[list[Look], RingPose]:
     # A posture from which one can look from most sides, of those that are soon reached.
     best: list[FloatArray] = []
     for q in family[np.argsort(times)[:: max(1, len(family) // 12)]]:
-        around = [near for view in _views(goal, env.spec.time_limit_steps) if (near := _near(q, view)) is not None]
+        around = [
+            near
+            for view in _views(goal, env.spec.time_limit_steps)
+            if (near := _near(q, view)) is not None
+        ]
         best = max(best, around, key=len)
     looks = []
     for number, q in enumerate(best):

@@ -61,10 +61,10 @@ def make_observables(task: "ArmTask") -> dict[str, observable.Observable]:
 
     Returns:
         Observables by name: ``eih``, ``eth`` uint8 (H, W, C); ``eih_depth``, ``eth_depth`` float32
-        (H, W, 1) m, 0 where a noisy one has no measurement; ``joint_positions`` (7,) rad, ``joint_velocities`` (7,) rad/s, as measured;
-        privileged: ``flange_position``, ``goal_position`` (3,) m, ``goal_normal`` (3,); and what
-        the family adds. With ``normalise_observation`` pictures are float32 in [0, 1] and joints
-        in [-1, 1].
+        (H, W, 1) m, 0 where a noisy one has no measurement; ``joint_positions`` (7,) rad,
+        ``joint_velocities`` (7,) rad/s, as measured; privileged: ``flange_position``,
+        ``goal_position`` (3,) m, ``goal_normal`` (3,); and what the family adds. With
+        ``normalise_observation`` pictures are float32 in [0, 1] and joints in [-1, 1].
     """
     spec = task.spec
     bank = _noise_bank(spec.image_noise) if spec.image_noise > 0 else None
