@@ -4,7 +4,7 @@ PY := .venv/bin/python
 # Two test workers on two cores: more threads inside each would only fight over them.
 PYTEST := OMP_NUM_THREADS=1 $(PY) -m pytest -n 2 --dist loadfile
 
-.PHONY: help demo reproduce test test-full lint lock certificates clean
+.PHONY: help demo docs reproduce test test-full lint lock certificates clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*##/\t/' | expand -t 12
@@ -21,6 +21,10 @@ test: lint  ## ruff, mypy and every behaviour once (under 15 minutes)
 
 test-full: lint  ## the same on the large counts (up to 80 minutes)
 	@$(PYTEST)
+
+docs: .venv/.up-to-date  ## the documentation as a web site, in build/docs (under 5 minutes)
+	@$(PY) -m sphinx --quiet --fail-on-warning --keep-going docs build/docs
+	@echo "open build/docs/index.html"
 
 lint: .venv/.up-to-date  ## ruff and mypy
 	@$(PY) -m ruff check .

@@ -102,7 +102,7 @@ def evaluate(
         wall_s = _play_rest(
             kept,
             rollout.play(
-                MakeTask(task, split, options),
+                MakeTask(task, split, options, pictures=player.looks),
                 make,
                 [index for index in order if index not in kept.trials],
                 PlayTrial(decision_limit_s, kept.salt),

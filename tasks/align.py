@@ -8,6 +8,7 @@ one can see where a policy settles.
 import dataclasses
 import functools
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
@@ -84,6 +85,35 @@ class Align(Placing[AlignSpec, AlignScenario]):
     Raises:
         OptionError: A goal that was asked for is out of reach.
     """
+
+    hard: ClassVar[Mapping[str, str]] = {
+        "align-fixed": (
+            "Nothing: ten places, seen from a known start, and wide tolerances. It shows "
+            "whether a policy learns at all."
+        ),
+        "align-easy": (
+            "The target may lie anywhere on the ring, so that the way has to be read from the "
+            "pictures; the upright arm hides some targets from the eye to hand."
+        ),
+        "align-thesis": (
+            "A millimetre, where a pixel of the eye to hand shows eight: the last part of the "
+            "way has to be servoed with the eye in the hand."
+        ),
+        "align-hard": (
+            "Light, colours and texture change, the eye to hand stands up to a centimetre and a "
+            "degree from where it should, and the start may be anywhere: the far camera says "
+            "only about where the target is."
+        ),
+        "align-drill": (
+            "A quarter of a millimetre over a small disc, held for five steps. Encoders are off "
+            "by up to a tenth of a degree and commands act a step late, so neither the joints "
+            "nor the last picture can be trusted to the tolerance."
+        ),
+        "align-limit": (
+            "A tenth of a millimetre and a fifth of a degree: what the controller and the "
+            "pictures still give when nothing disturbs them."
+        ),
+    }
 
     def surface(self) -> "Surface":
         """The surface that was asked for."""

@@ -14,7 +14,7 @@ the paint shows.
 
 import dataclasses
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
@@ -174,6 +174,22 @@ class ClutterScenario(Scenario):
 
 class Clutter(Placing[ClutterSpec, ClutterScenario]):
     """One target among other things."""
+
+    hard: ClassVar[Mapping[str, str]] = {
+        "clutter-distractors": (
+            "Squares, rings and half discs have the target's colour, other discs its outline; "
+            "only both together tell which thing is meant, from far off and at a slant."
+        ),
+        "clutter-choice": (
+            "The pictures do not say which disc is meant; the sentence and an observation do, "
+            "so that a policy has to join the two."
+        ),
+        "clutter-obstacles": (
+            "Posts, boxes and an overhang stand in the way and may hide the target from the eye "
+            "to hand, and one of them moves at a moment that nobody knows. Touching anything "
+            "ends the episode."
+        ),
+    }
 
     certificate_passes: ClassVar[int] = 4
 

@@ -106,6 +106,19 @@ class SequenceScenario(Scenario):
 class Sequence(Placing[SequenceSpec, SequenceScenario]):
     """Targets that appear one after the other."""
 
+    hard: ClassVar[Mapping[str, str]] = {
+        "sequence-thesis": (
+            "Each target vanishes when it was reached or when its time is up, and the next may "
+            "lie half around the base: five ways in a row have to succeed, from wherever the "
+            "arm stands."
+        ),
+        "sequence-hard": (
+            "There is time for the way and for one look from above, not for two. The eye to "
+            "hand errs by up to ten centimetres on the table; what the first target shows of "
+            "this error would serve for the next four."
+        ),
+    }
+
     def draw(self, streams: Streams) -> SequenceScenario:
         """Draw targets, start and look."""
         from hvs_suite.tasks.shared.start import draw_start

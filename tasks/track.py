@@ -130,6 +130,22 @@ class TrackScenario(Scenario):
 class Track(Placing[TrackSpec, TrackScenario]):
     """A target that moves over the level table."""
 
+    hard: ClassVar[Mapping[str, str]] = {
+        "track-line": (
+            "Pictures show where the target was, and the arm trails its set point: at 100 mm/s "
+            "a policy that aims at what it sees is ten millimetres late."
+        ),
+        "track-curve": (
+            "Direction and speed change all the time, so that the past says less and less of "
+            "what comes; the arm has to aim ahead all the same."
+        ),
+        "track-hard": (
+            "Commands act a step late, which nobody tells the policy: it has to know where the "
+            "target will be 0.2 s from now, to a millimetre, on a motion that cannot be "
+            "foreseen."
+        ),
+    }
+
     def draw(self, streams: Streams) -> TrackScenario:
         """Draw motion, start and look."""
         from hvs_suite.tasks.shared.start import draw_start

@@ -17,6 +17,8 @@ from hvs_suite.rollout import PolicyFactory
 
 PRIVILEGED = ("expert", "random")
 """Policies that may look behind the observations: at the true state, or at the scenario's index."""
+BLIND = ("expert", "zero", "random")
+"""Policies that look at no picture; without pictures they are played in a third of the time."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +33,7 @@ class Contender:
         parameters: As ``policy_parameters``.
         training_steps: As in the result.
         training_hours: As in the result.
+        looks: Whether it looks at pictures.
     """
 
     name: str
@@ -40,6 +43,7 @@ class Contender:
     parameters: int | None = None
     training_steps: int | None = None
     training_hours: float | None = None
+    looks: bool = True
 
 
 def find(policy: str, task: str, options: Mapping[str, Any] = AS_NAMED) -> Contender:
@@ -70,7 +74,7 @@ def find(policy: str, task: str, options: Mapping[str, Any] = AS_NAMED) -> Conte
     folder: str | None = getattr(make, "folder", None)
     if folder is None:
         make = make if policy in PRIVILEGED else Blindfolded(make)
-        return Contender(name=name, kind="builtin", make=make)
+        return Contender(name=name, kind="builtin", make=make, looks=policy not in BLIND)
     training = provenance.training(Path(folder))
     return Contender(
         name=name,

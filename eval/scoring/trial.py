@@ -147,7 +147,7 @@ class MakeTask:
         task: Named task.
         split: Split its scenarios come from.
         options: Options that differ from it.
-        pictures: Draw the observations; a re-simulation needs none.
+        pictures: Draw the observations; a re-simulation or a policy that does not look needs none.
     """
 
     task: str

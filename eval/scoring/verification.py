@@ -191,10 +191,11 @@ def _in_parts(
         yield logged, builtin.make_zero, False
     rest = [index for index in chosen if index >= n_logged]
     if rest:
-        yield rest, builtin_policy(path, result), True
+        player = builtin_policy(path, result)
+        yield rest, player.make, player.looks
 
 
-def builtin_policy(path: Path, result: Result) -> rollout.PolicyFactory:
+def builtin_policy(path: Path, result: Result) -> contender.Contender:
     """Returns the built-in policy that a result names.
 
     Args:
@@ -211,7 +212,7 @@ def builtin_policy(path: Path, result: Result) -> rollout.PolicyFactory:
             f"{path}: {shown(policy)!r} is no built-in policy, but the action log does not hold "
             "all scenarios; evaluate again"
         )
-    return contender.find(policy, result.summary.task).make
+    return contender.find(policy, result.summary.task)
 
 
 def check_task(path: Path, result: Result) -> None:

@@ -34,7 +34,8 @@ class Show:
 
     Attributes:
         task: A named task, such as align-thesis.
-        out: Picture to write (.png).
+        out: Picture to write (.png), or a page of all that there is to know (.md) with the picture
+            beside it.
         scenario: Index of the test scenario to draw.
         option: Parameter of the task to change for a study, such as target_diameter_m=0.03; give it
             several times for several.
@@ -48,22 +49,32 @@ class Show:
     def run(self) -> None:
         """Draw the picture and print the certificate."""
         import hvs_suite
-        from hvs_suite.errors import OutputError
+        from hvs_suite.errors import OptionError, OutputError
         from hvs_suite.files import check_writable, replacing
         from hvs_suite.registry import find
         from hvs_suite.tasks.shared import lock
         from hvs_suite.tasks.shared.certificate import load_certificate
+        from hvs_suite.tasks.shared.page import page
 
-        if self.out.suffix.lower() != ".png":
-            raise OutputError(f"{self.out} must end in .png")
+        if self.out.suffix.lower() not in (".png", ".md"):
+            raise OutputError(f"{self.out} must end in .png or .md")
         check_writable(self.out)
         options = find(self.task).options_from_text(self.option)
         has_one = lock.is_own(self.task) and not options
         certificate = load_certificate(self.task) if has_one else None
+        is_page = self.out.suffix.lower() == ".md"
+        # A page's picture is kept with the project: in a tenth of the bytes.
+        picture = self.out.with_suffix(".webp") if is_page else self.out
+        if is_page and certificate is None:
+            raise OptionError(f"{self.task} as asked for has no certificate to make a page of")
         with hvs_suite.load(self.task, split="test", **options) as env:
             start, goal = look(env, self.scenario)
             figure = draw(env.spec, self.scenario, start, goal, certificate)
-        with replacing(self.out) as temporary:
+            if is_page and certificate is not None:
+                with replacing(self.out) as temporary:
+                    text = page(env, certificate, picture.name)
+                    temporary.write_text(text, encoding="utf-8")
+        with replacing(picture) as temporary:
             figure.savefig(temporary, dpi=DPI, facecolor="white")
         if certificate is not None:
             console.print_table(

@@ -74,6 +74,8 @@ class Family[S: Spec, C: Scenario](abc.ABC):
     scenario: C
     certificate_passes: ClassVar[int] = 3
     """How often `certify` goes over the scenarios, for progress bars."""
+    hard: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    """What is hard about each of the named tasks, for its page; by name."""
 
     def __init__(self, spec: S, named: S | None = None) -> None:
         self.spec = spec

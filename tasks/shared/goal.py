@@ -71,8 +71,9 @@ class Tip:
 def goal_errors(tip: Tip, goal: Goal) -> dict[str, float]:
     """How far a tip is from a goal.
 
-    With d = tip - target and n the normal: height = d . n - standoff, lateral = |d - (d . n) n|,
-    position = hypot(lateral, height), tilt = atan2(|a x n|, -a . n) for the tool's axis a.
+    With d = tip - target and n the normal: height = d . n - standoff,
+    lateral = norm(d - (d . n) n), position = hypot(lateral, height),
+    tilt = atan2(norm(a x n), -a . n) for the tool's axis a.
 
     Args:
         tip: Where the tip is.

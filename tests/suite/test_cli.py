@@ -11,21 +11,10 @@ import sys
 import docstring_parser
 import pytest
 
+import hvs_suite
 from hvs_suite.cli.main import COMMANDS, run
 
-TASKS = (
-    "align-fixed",
-    "align-easy",
-    "align-thesis",
-    "align-hard",
-    "align-drill",
-    "align-limit",
-    "sequence-thesis",
-    "sequence-hard",
-    "track-line",
-    "track-curve",
-    "track-hard",
-)
+TASKS = tuple(hvs_suite.TASKS)
 
 
 def refusal(capsys, *words):

@@ -50,23 +50,6 @@ def test_textures_are_keyed_pictures_with_some_contrast() -> None:
     assert one.std() > 5
 
 
-@pytest.mark.each_task
-def test_the_target_can_be_found_by_its_colour_under_the_task_s_own_disturbances(
-    named: Named, task: str
-) -> None:
-    env = named(task)
-    misses = []
-    for index in range(25):
-        seen = env.reset(scenario=index).observation
-        u, v, _, visible = env.privileged()["target_eth"]
-        if visible:
-            found = find_disc(seen["eth"])
-            true = (np.array([u, v]) + 1) / 2 * env.spec.eth_resolution - 0.5
-            misses.append(np.inf if found is None else np.linalg.norm(found.centre - true))
-    assert len(misses) > 15
-    assert np.mean(np.array(misses) <= 1.5) >= 0.9
-
-
 @pytest.mark.parametrize("task", ["align-thesis", "align-hard"])
 def test_nothing_else_in_the_cell_is_as_red_as_the_target(named: Named, task: str) -> None:
     """Where the target is taken away, nothing is found: not the orange of the robot either."""

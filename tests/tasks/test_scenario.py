@@ -55,7 +55,7 @@ def test_options_that_do_not_shape_the_scene_leave_it_alone(task: str) -> None:
         {"position_tolerance_mm": 9.0, "tilt_tolerance_deg": 3.0},
         {"discount": 0.9, "time_limit": "hard"},
         {"eth_position_m": (-1.0, 0.7, 2.5), "eih_fov_deg": 65.0},
-        {"target_diameter_m": 0.03, "marker": "ring"},
+        {"target_diameter_m": 0.03},
         {"acceleration_limits": True},
     ):
         assert digests(source(task, **options), [0, 5]) == expected, options
