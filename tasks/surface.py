@@ -17,7 +17,7 @@ Touching the panel ends the episode.
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -157,6 +157,22 @@ class SurfaceScenario(Scenario):
 
 class Surface(Placing[SurfaceSpec, SurfaceScenario]):
     """One target on a panel."""
+
+    hard: ClassVar[Mapping[str, str]] = {
+        "surface-tilted": (
+            "Nobody tells how high the target lies, nor which way the panel leans: a place that "
+            "the eye to hand sees is off by centimetres, and the plane z = 0 means nothing."
+        ),
+        "surface-fuselage": (
+            "The skin is curved, and the marks on it are small: half a degree takes more than one "
+            "look, or one from near and straight above, where the tool has to be in the end."
+        ),
+        "surface-hard": (
+            "At 50 mm, 0.25 mm sideways are 0.29 deg of the normal, told by six marks of 1.7 mm "
+            "on a ring of 17 mm: one look from the goal leaves degrees. It takes many, from well "
+            "to the side, and there is time for about thirty."
+        ),
+    }
 
     def build(self, cell: "Cell") -> None:
         """Attach target, marks and panels."""
