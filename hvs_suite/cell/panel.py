@@ -5,6 +5,7 @@ origin lies in the middle of the skin, x and y along it and z outward.
 """
 
 import dataclasses
+import functools
 import math
 
 import cv2
@@ -53,9 +54,8 @@ class Panel(Prop):
         self.side_m, self.curvature = side_m, curvature
         self._start(name, (0.70, 0.72, 0.66, 1.0))
         if seams is not None:
-            picture = iio.imwrite("<bytes>", _skin(seams, side_m), extension=".png")
             self._material.texture = self._root.asset.add(
-                "texture", name=name, type="2d", file=mjcf.Asset(picture, ".png")
+                "texture", name=name, type="2d", file=mjcf.Asset(_skin(seams, side_m), ".png")
             )
         mesh = self._mesh()
         self._root.asset.add(
@@ -115,7 +115,8 @@ class Panel(Prop):
         return trimesh.convex.convex_hull(np.concatenate([top, self.corners()]))
 
 
-def _skin(key: int, side_m: float) -> npt.NDArray[np.uint8]:
+@functools.cache
+def _skin(key: int, side_m: float) -> bytes:
     """What a used panel looks like: lap seams with rivets on either side, stains and scratches.
 
     Args:
@@ -123,7 +124,7 @@ def _skin(key: int, side_m: float) -> npt.NDArray[np.uint8]:
         side_m: Side of the panel (m).
 
     Returns:
-        Grey values as RGB, uint8 (512, 512, 3).
+        PNG of grey values as RGB, 512 x 512 px.
     """
     random = np.random.Generator(np.random.Philox(key=key))
     scale = _TEXTURE_PX / side_m
@@ -142,7 +143,7 @@ def _skin(key: int, side_m: float) -> npt.NDArray[np.uint8]:
             _draw_seam(picture, place)
             if is_riveted:
                 _draw_rivets(picture, place, scale, random)
-    return np.repeat(picture[..., None], 3, axis=2)
+    return iio.imwrite("<bytes>", np.repeat(picture[..., None], 3, axis=2), extension=".png")
 
 
 def _draw_seam(canvas: npt.NDArray[np.uint8], place_px: float) -> None:

@@ -41,7 +41,7 @@ _FARTHER_M = 0.005
 _N_SIDES = 10
 _DETOUR_RAD = 1.2
 """A joint turns farther than this only where the arm has to take another shape."""
-_SURE_SHARE = 0.25
+_SURE_SHARE = 0.4
 """The standard deviation that is good enough, in tolerances."""
 _THERE_M, _THERE_COS = 0.012, math.cos(math.radians(8.0))
 _STEPS_TO_GOAL = 7
@@ -63,10 +63,10 @@ class SlopedTargetServo(StillTargetServo):
         lean = math.sin(math.radians(spec.tilt_deg[1]))
         self._highest_m = spec.raise_m[1] + SIDE_M * lean + 0.02
         self._ring = Ring(spec.mark_ring_m, spec.n_marks, spec.sag_m)
-        tolerance_mm = spec.position_tolerance_mm or spec.lateral_tolerance_mm or 1.0
-        self._sure = _SURE_SHARE * np.array(
-            [1e-3 * tolerance_mm] * 3 + [math.radians(spec.tilt_tolerance_deg)] * 2
-        )
+        tolerance_m = 1e-3 * spec.tightest_tolerance_mm
+        # A slope that is off shifts the flange as well.
+        slope_rad = min(math.radians(spec.tilt_tolerance_deg), tolerance_m / spec.standoff_m)
+        self._needed = _SURE_SHARE * np.array([tolerance_m] * 3 + [slope_rad] * 2)
         super().__init__(spec)
 
     def reset(self) -> None:
@@ -85,6 +85,7 @@ class SlopedTargetServo(StillTargetServo):
         self._turning = 1.0
         self._is_going = False
         self._waited = 0
+        self._sure = self._needed
 
     def _perceive(self, observation: Observation, q: FloatArray) -> None:
         """Take in both pictures."""

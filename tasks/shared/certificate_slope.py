@@ -36,10 +36,10 @@ def check_slope(env: "Environment", scenarios: Iterable[int], ring: Ring) -> lis
     """Do the marks show slope and place well enough for every tolerance?
 
     The reference estimator looks from all sides and from the goal, from wherever the arm can
-    without taking another shape, in two thirds of an episode's steps; it sees pictures with the task's
-    own noise, knows which patch is which mark, and fits the ring to all of them. The tip that goes
-    where it says is held against the goal: a slope that is off by a small angle a shifts the tip by
-    standoff * a.
+    without taking another shape, in two thirds of an episode's steps. It sees pictures with the
+    task's own noise, knows which patch is which mark, and fits the ring to all of them. The tip
+    that goes where it says is held against the goal: a slope that is off by a small angle a shifts
+    the tip by standoff * a.
 
     Args:
         env: The named task, with scenarios that have ``marks``.
