@@ -20,6 +20,7 @@ import numpy.typing as npt
 from hvs_suite.cell.kinematics import away_from_stops
 from hvs_suite.cell.robot import JOINT_ACCELERATION_RAD_S2
 from hvs_suite.cell.solid import Solid
+from hvs_suite.errors import PolicyError
 from hvs_suite.policies.servo.slope_estimate import SlopeEstimate
 from hvs_suite.policies.servo.still_target import StillTargetServo, within_reach
 from hvs_suite.rollout import Observation
@@ -43,10 +44,16 @@ _DETOUR_RAD = 1.2
 """A joint turns farther than this only where the arm has to take another shape."""
 _SURE_SHARE = 0.4
 """The standard deviation that is good enough, in tolerances."""
+_SURER = 0.7
+"""By so much surer it has to be the next time, when it had been wrong."""
 _THERE_M, _THERE_COS = 0.012, math.cos(math.radians(8.0))
+"""Near enough to where it looks from to head for the next place."""
+_STANDS_M = 0.001
 _STEPS_TO_GOAL = 7
+"""From the side to the goal, with one to spare."""
 _PATIENCE = 3
-_DEPTH_M = 0.20
+_EYE_TO_HAND_M = 0.005
+_PANEL_DEPTH_M = 0.20
 
 
 class SlopedTargetServo(StillTargetServo):
@@ -60,6 +67,8 @@ class SlopedTargetServo(StillTargetServo):
     """
 
     def __init__(self, spec: SurfaceSpec) -> None:
+        if "eih" not in spec.observed:
+            raise PolicyError("servo tells a slope by the eye in the hand; keep eih")
         lean = math.sin(math.radians(spec.tilt_deg[1]))
         self._highest_m = spec.raise_m[1] + SIDE_M * lean + 0.02
         self._ring = Ring(spec.mark_ring_m, spec.n_marks, spec.sag_m)
@@ -81,7 +90,6 @@ class SlopedTargetServo(StillTargetServo):
         spec = self._variant
         self._slope = SlopeEstimate(self._ring, spec.target_diameter_m, (0.0, self._highest_m))
         self._side: float | None = None
-        self._n_sides = 0
         self._turning = 1.0
         self._is_going = False
         self._waited = 0
@@ -93,19 +101,18 @@ class SlopedTargetServo(StillTargetServo):
         R, p = self._kinematics.flange_pose(q)
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = R.T, -R.T @ p
-        if self._has_eih:
-            discs = find_discs(observation["eih"], most=2 * self._ring.n_marks)
-            before = self._slope.n_looks, self._slope.is_seen_closely
-            self._slope.see_eih(discs, self._eih_K, T)
-            if discs or (self._slope.n_looks, self._slope.is_seen_closely) != before:
-                self._misses = 0
-            elif self._slope.place is not None and self._should_see(T, self._slope.place):
-                self._misses += 1
-                if self._misses > self.max_misses:
-                    self._start_over()
+        discs = find_discs(observation["eih"], most=2 * self._ring.n_marks)
+        self._slope.see_eih(discs, self._eih_K, T)
+        if discs:
+            self._misses = 0
+        elif self._slope.place is not None and self._should_see(T, self._slope.place):
+            self._misses += 1
+            if self._misses > self.max_misses:
+                self._start_over()
         if self._has_eth and not self._slope.is_seen_closely:
             for disc in find_discs(observation["eth"])[:1]:
-                self._slope.see_eth(disc, self._eth_K, self._eth_T, self._eth_sigma_m + 0.005)
+                sigma_m = self._eth_sigma_m + _EYE_TO_HAND_M
+                self._slope.see_eth(disc, self._eth_K, self._eth_T, sigma_m)
         if self._slope.place is None:
             self._rule_out(q, T)
 
@@ -145,12 +152,12 @@ class SlopedTargetServo(StillTargetServo):
             self._waited = 0
             return
         _, p = self._kinematics.flange_pose(q)
-        if np.linalg.norm(p - goal.position) < 0.001:
+        if np.linalg.norm(p - goal.position) < _STANDS_M:
             self._waited += 1
         if self._waited > spec.hold_steps + _PATIENCE and not is_late:
             # It stands where it believes the goal to be, and the episode goes on.
-            self._is_going, self._n_sides = False, 0
-            self._sure = 0.7 * self._sure
+            self._is_going = False
+            self._sure = _SURER * self._sure
 
     def _from_the_side(self, q: FloatArray, place: FloatArray, normal: FloatArray) -> Goal:
         """The next place on the circle around the target from which to look at it.
@@ -173,7 +180,6 @@ class SlopedTargetServo(StillTargetServo):
             if not is_near:
                 self._turning = -self._turning
             self._side += self._turning * 2.0 * math.pi / _N_SIDES
-            self._n_sides += 1
         return look
 
     def _is_near(self, q: FloatArray, look: Goal, goal: Goal) -> bool:
@@ -201,5 +207,7 @@ def _around(place: FloatArray, normal: FloatArray) -> Solid:
     sine = float(np.linalg.norm(axis))
     lean = axis / max(sine, 1e-12) * math.atan2(sine, float(normal[2]))
     a, b, c = lean.tolist()
-    x, y, z = (place - 0.5 * _DEPTH_M * normal).tolist()
-    return Solid("box", (half, half, 0.5 * _DEPTH_M), (x, y, z), lean=(a, b, c), is_faced=True)
+    x, y, z = (place - 0.5 * _PANEL_DEPTH_M * normal).tolist()
+    return Solid(
+        "box", (half, half, 0.5 * _PANEL_DEPTH_M), (x, y, z), lean=(a, b, c), is_faced=True
+    )
