@@ -27,6 +27,7 @@ def make_servo(env: Playground) -> Policy:
     from hvs_suite.policies.servo.among_others import AmongOthersServo
     from hvs_suite.policies.servo.changing_target import ChangingTargetServo
     from hvs_suite.policies.servo.moving_target import MovingTargetServo
+    from hvs_suite.policies.servo.sloped_target import SlopedTargetServo
     from hvs_suite.policies.servo.still_target import StillTargetServo
 
     servos: dict[str, type[Any]] = {
@@ -34,6 +35,7 @@ def make_servo(env: Playground) -> Policy:
         "sequence": ChangingTargetServo,
         "track": MovingTargetServo,
         "clutter": AmongOthersServo,
+        "surface": SlopedTargetServo,
     }
     spec = env.spec
     if spec.family not in servos:
