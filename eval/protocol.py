@@ -83,8 +83,7 @@ def evaluate(
         RenderError: Nothing here can draw the images.
         ServerError: The policy's server is gone; what is already played is kept.
     """
-    executor.check_workers(workers)
-    _check_episodes(split, episodes)
+    _check_counts(split, episodes, workers)
     check_decision_limit(decision_limit_s)
     spec = registry.find(task).with_options(options)
     options = registry.options_of(spec)
@@ -205,7 +204,8 @@ class _Evaluation:
         return result, log
 
 
-def _check_episodes(split: str, episodes: int) -> None:
+def _check_counts(split: str, episodes: int, workers: executor.Workers) -> None:
+    executor.check_workers(workers)
     if episodes < 1:
         raise OptionError(f"episodes must be at least 1, not {episodes}")
     if split == TEST_SPLIT and episodes > TEST_SCENARIOS:

@@ -96,22 +96,8 @@ class RayCluster:
             HvsError: Whatever typed error an actor raised.
             RuntimeError: Any other failure, or an index that ends every actor.
         """
-        ray = join(self.address)
-        with contextlib.ExitStack() as stack:
-            notes = None
-            if on_note is not None:
-                from ray.util import queue
-
-                notes = queue.Queue(actor_options={"num_cpus": 0})
-                stack.callback(notes.shutdown, force=True)
-            crew = stack.enter_context(
-                contextlib.closing(_Crew(ray, self, make, indices, ahead, notes))
-            )
-            for result in crew.results():
-                if on_note is not None and notes is not None:
-                    for words in notes.get_nowait_batch(notes.qsize()):
-                        on_note(words)
-                yield from result
+        with contextlib.closing(_Crew(self, make, indices, ahead, on_note)) as crew:
+            yield from crew.results()
 
 
 def join(address: str) -> Any:
@@ -210,14 +196,13 @@ class _Crew:
 
     def __init__(
         self,
-        ray: Any,
         cluster: RayCluster,
         make: Make[Any],
         indices: Sequence[int],
         ahead: int,
-        notes: Any,
+        on_note: Note | None,
     ) -> None:
-        self._ray = ray
+        self._ray = join(cluster.address)
         self._cluster = cluster
         self._indices = indices
         self._ahead = ahead
@@ -226,24 +211,30 @@ class _Crew:
         self._actors: list[_Actor] = []
         self._ended: collections.Counter[int | None] = collections.Counter()
         self._next_look = 0.0
-        self._horizon = 0
         self._here = installed()
+        self._on_note = on_note
+        self._notes: Any = None
+        if on_note is not None:
+            from ray.util import queue
+
+            self._notes = queue.Queue(actor_options={"num_cpus": 0})
         try:
             # Once for all; in a list, because what cannot be read there is to be told by the actor.
-            job = [ray.put((make, notes))]
+            job = [self._ray.put((make, self._notes))]
         except TypeError as error:
             raise OptionError(
                 f"factories travel to other machines, and this one cannot ({first_line(error)})"
             ) from error
-        self._new = functools.partial(remote(ray, _Worker), job)
+        self._new = functools.partial(remote(self._ray, _Worker), job)
 
-    def results(self) -> Iterator[list[Any]]:
-        """Yields lists of results, empty ones where only time has passed."""
+    def results(self) -> Iterator[Any]:
+        """Yields results as they come."""
         gone = (self._ray.exceptions.RayActorError, self._ray.exceptions.ObjectLostError)
         while heads := [*(a.told[0][0] for a in self._actors if a.told), *self._waiting[:1]]:
-            self._horizon = min(heads) + OUT_OF_TURN * max(1, len(self._actors))
             self._grow()
-            found = []
+            horizon = min(heads) + OUT_OF_TURN * len(self._actors)
+            for actor in self._actors:
+                self._tell(actor, horizon)
             for actor in self._answered():
                 try:
                     _, content = opened(self._ray.get(actor.answer))
@@ -254,11 +245,18 @@ class _Crew:
                     actor.machine, there = content
                     self._check(there)
                     del self._ended[None]
+                    self._tell(actor, horizon)
                 else:
                     actor.told.popleft()
-                    found.append(content)
-                self._tell(actor)
-            yield found
+                    self._tell(actor, horizon)
+                    yield content
+            self._hear()
+
+    def _hear(self) -> None:
+        """Passes on what actors have said."""
+        if self._on_note is not None:
+            for words in self._notes.get_nowait_batch(self._notes.qsize()):
+                self._on_note(words)
 
     def close(self) -> None:
         """Ends all actors: those that have nothing to do by their own closing."""
@@ -268,6 +266,8 @@ class _Crew:
             self._ray.wait(closed, num_returns=len(closed), timeout=WORKER_EXIT_TIMEOUT_S)
         for actor in self._actors:
             self._ray.kill(actor.handle)
+        if self._notes is not None:
+            self._notes.shutdown(force=True)
 
     def _grow(self) -> None:
         """Asks for actors as long as there is work for more of them."""
@@ -279,8 +279,6 @@ class _Crew:
         for _ in range(len(self._actors), min(self._cluster.size(), left)):
             handle = self._new()
             self._actors.append(_Actor(handle, handle.make.remote()))
-        for actor in self._actors:
-            self._tell(actor)
 
     def _answered(self) -> list[_Actor]:
         """Actors whose next answer is there; waits for one, but not for long."""
@@ -291,11 +289,11 @@ class _Crew:
         every, _ = self._ray.wait([*owing], num_returns=len(owing), timeout=0)
         return [owing[answer] for answer in every]
 
-    def _tell(self, actor: _Actor) -> None:
-        """Tells an actor as much ahead as it may hold."""
+    def _tell(self, actor: _Actor, horizon: int) -> None:
+        """Tells an actor as much ahead as it may hold, of what lies before the horizon."""
         if actor.machine is None:
             return
-        while self._waiting and self._waiting[0] < self._horizon and len(actor.told) < self._ahead:
+        while self._waiting and self._waiting[0] < horizon and len(actor.told) < self._ahead:
             place = heapq.heappop(self._waiting)
             actor.told.append((place, actor.handle.call.remote(self._indices[place])))
 

@@ -100,8 +100,7 @@ def finetune(
         PolicyError: The policy cannot be fine-tuned, or does not fit the task.
         OptionError: No budget, or a value that makes no sense.
         OutputError: ``out`` cannot be written, or holds something else than this run.
-        ClusterError: The cluster cannot be joined, or lost a machine that played; the same call
-            goes on from the last checkpoint.
+        ClusterError: The cluster cannot be joined, or lost a machine that played.
     """
     settings = settings or Settings()
     spec = find(task).with_options(options or {})
@@ -112,16 +111,8 @@ def finetune(
     check_fit(read_config(policy), policy, spec)
     load_base(policy)
     prepare_process()
-    identity = {
-        "base": weights_digest(policy),
-        "task": task,
-        "task_version": spec.version,
-        "options": options,
-        "curriculum": curriculum,
-        "split": split,
-        "seed": seed,
-        **dataclasses.asdict(settings),
-    }
+    make = MakeStage(task, options, levels, split, str(policy.resolve()), settings, seed)
+    identity = _identity(make, spec, curriculum)
     with contextlib.ExitStack() as stack:
         stack.enter_context(claimed(out, identity))
         budget = {"minutes": minutes, "steps": steps}
@@ -129,21 +120,32 @@ def finetune(
         # Torch and SB3 draw from the global generators of NumPy and torch.
         stack.enter_context(library_seeds(seed))
         evaluator = stack.enter_context(contextlib.closing(Evaluator(spec, options, eval_episodes)))
-        make = MakeStage(task, options, levels, split, str(policy.resolve()), settings, seed)
-        eyes = out / "training" / "eyes"
-        base = _with_new_eyes(make, eyes, spec, evaluator, on_progress, cluster)
-        learner = stack.enter_context(
-            _learner(dataclasses.replace(make, folder=str(base.resolve())), out, spec, cluster)
-        )
+        base = _with_new_eyes(make, out, spec, evaluator, on_progress, cluster)
+        make = dataclasses.replace(make, folder=str(base.resolve()))
+        learner = stack.enter_context(_learner(make, out, spec, cluster))
         run = Run(out, learner, evaluator, on_progress)
         stack.callback(run.close)
         run.train(limit, settings.collect_steps, eval_every, checkpoint_period_s)
         return run.outcome()
 
 
+def _identity(make: MakeStage, spec: Spec, curriculum: Kind | None) -> dict[str, Any]:
+    """What a run is a function of, but for its length."""
+    return {
+        "base": weights_digest(Path(make.folder)),
+        "task": make.task,
+        "task_version": spec.version,
+        "options": make.options,
+        "curriculum": curriculum,
+        "split": make.split,
+        "seed": make.seed,
+        **dataclasses.asdict(make.settings),
+    }
+
+
 def _with_new_eyes(
     make: MakeStage,
-    folder: Path,
+    out: Path,
     spec: Spec,
     evaluator: Evaluator,
     on_progress: Callable[[Progress], None] | None,
@@ -163,7 +165,14 @@ def _with_new_eyes(
             on_episode=lambda done: on_share("evaluating", done / evaluator.episodes),
         )
 
-    return train_eyes(make, folder, spec, evaluate, on_share, cluster or make.settings.environments)
+    return train_eyes(
+        make,
+        out / "training" / "eyes",
+        spec,
+        evaluate,
+        on_share,
+        cluster or make.settings.environments,
+    )
 
 
 @contextlib.contextmanager

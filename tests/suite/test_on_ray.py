@@ -1,5 +1,6 @@
 """Actors of a Ray cluster give what local processes give, whatever happens to them."""
 
+import contextlib
 import dataclasses
 import functools
 import os
@@ -7,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from test_rollout import Counter, Echo, as_plain, breaks, no_weights, where
 from hvs_suite import on_ray
 from hvs_suite.cli.main import run
 from hvs_suite.errors import ClusterError, OptionError, PolicyError
-from hvs_suite.executor import TOLD_AHEAD
+from hvs_suite.executor import TOLD_AHEAD, Note, spread
 from hvs_suite.on_ray import RayCluster
 from hvs_suite.policies.context import Blindfolded
 from hvs_suite.rollout import carried, play, rollout
@@ -148,6 +149,37 @@ def test_actors_run_no_further_ahead_than_they_are_told(
     assert len(ahead) == 60
     # The reader notes a result only after the next index is on its way.
     assert max(ahead) <= 2 * TOLD_AHEAD + 2
+
+
+@dataclasses.dataclass(frozen=True)
+class FirstIsLong:
+    """A worker that has much to do at index 0 and nothing at others."""
+
+    @contextlib.contextmanager
+    def __call__(self, note: Note) -> Iterator[Callable[[int], int]]:
+        def call(index: int) -> int:
+            note(index)
+            return index + 0 * sum(range(10**8 if index == 0 else 1))
+
+        yield call
+
+
+@pytest.mark.parametrize("ahead", [1, 3])
+def test_no_actor_is_far_ahead_of_the_oldest_that_is_not_done(
+    cluster: RayCluster, monkeypatch: pytest.MonkeyPatch, ahead: int
+) -> None:
+    monkeypatch.setattr(on_ray, "OUT_OF_TURN", 4)
+    said: list[int] = []
+    found: list[int] = []
+    for index in spread(
+        FirstIsLong(), range(40), workers=cluster, ahead=ahead, on_note=said.append
+    ):
+        assert index < min(set(range(40)) - set(found)) + 2 * 4
+        found.append(index)
+    assert sorted(found) == list(range(40))
+    # What was said last may not have come before the end.
+    assert set(said) <= set(found)
+    assert 0 in said
 
 
 def test_environments_are_closed_in_the_end(cluster: RayCluster, tmp_path: Path) -> None:
