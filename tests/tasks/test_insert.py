@@ -45,7 +45,7 @@ class Hand:
         env.reset(scenario=scenario)
         self.model = kinematics(env.spec.embodiment)
         self.mouth = env.goal().target
-        self.place = self.mouth + [aside_m, 0.0, 0.0]
+        self.place = self.mouth + np.array([aside_m, 0.0, 0.0])
         above = self.model.goal_configurations_at_tool_angle(self.place + 0.004 * UP, UP, 0.0)
         self.set_point = above[np.abs(above).max(axis=1).argmin()]
         env.task.place(env.physics, self.set_point)
@@ -192,7 +192,7 @@ def test_beside_the_bushing_no_depth_counts(env: Environment) -> None:
     goal = env.goal()
     from hvs_suite.tasks.shared.goal import Tip
 
-    errors = env.task.family.measure(Tip(goal.position + [0.01, 0.0, 0.0], -UP))
+    errors = env.task.family.measure(Tip(goal.position + np.array([0.01, 0.0, 0.0]), -UP))
     assert errors[DEPTH] == 0.0
     assert errors[LATERAL] > env.spec.step_bounds[LATERAL]
 
