@@ -164,7 +164,7 @@ class FirstIsLong:
         yield call
 
 
-@pytest.mark.parametrize("ahead", [1, 3])
+@pytest.mark.parametrize("ahead", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_no_actor_is_far_ahead_of_the_oldest_that_is_not_done(
     cluster: RayCluster, monkeypatch: pytest.MonkeyPatch, ahead: int
 ) -> None:
@@ -182,6 +182,7 @@ def test_no_actor_is_far_ahead_of_the_oldest_that_is_not_done(
     assert 0 in said
 
 
+@pytest.mark.slow
 def test_environments_are_closed_in_the_end(cluster: RayCluster, tmp_path: Path) -> None:
     make = functools.partial(Closing, str(tmp_path))
     places = {process for process, _ in play(make, Echo, range(20), where, workers=cluster)}
