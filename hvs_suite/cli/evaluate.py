@@ -31,8 +31,8 @@ class Evaluate(Players):
         task: Named task, such as align-thesis; give it several times for several tasks.
         out: Result file to write (JSON), replaced if it exists; for several tasks, the folder to
             write <task>.json into.
-        policy: expert, servo, zero, random, pretrained, finetuned, a checkpoint folder or Hub id,
-            or module:factory, which imports and runs that code. With --server, a name for the
+        policy: expert, servo, push, zero, random, pretrained, finetuned, a checkpoint folder or Hub
+            id, or module:factory, which imports and runs that code. With --server, a name for the
             result.
         split: Scenarios to play; test holds 1000, any other name has no end.
         episodes: Number of scenarios.

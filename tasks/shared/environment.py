@@ -140,9 +140,10 @@ class Environment(composer.Environment):
         task = self._arm
         collided = False
         for _ in range(self._n_sub_steps):
+            touched = data.ncon
             mujoco.mj_step2(model, data)
             mujoco.mj_step1(model, data)
-            if data.ncon and task.is_forbidden(physics):
+            if (touched or data.ncon) and task.is_forbidden(physics):
                 collided = True
                 break
         self._control_steps += 1
