@@ -102,7 +102,8 @@ def test_actors_give_the_episodes_that_one_process_gives(cluster: RayCluster) ->
 def test_actors_are_other_processes_held_to_one_thread(cluster: RayCluster) -> None:
     played = play(Counter, Echo, range(1000), where, workers=cluster)
     places = {next(played) for _ in range(100)}
-    assert {threads for _, threads in places} == {"1"}
+    # One of its own, or (0) the calling one, which the cell prefers.
+    assert {threads for _, threads in places} <= {"0", "1"}
     processes = {process for process, _ in places}
     assert os.getpid() not in processes
     # Leaving the iterator ends them.
@@ -164,7 +165,7 @@ class FirstIsLong:
         yield call
 
 
-@pytest.mark.parametrize("ahead", [1, 3])
+@pytest.mark.parametrize("ahead", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_no_actor_is_far_ahead_of_the_oldest_that_is_not_done(
     cluster: RayCluster, monkeypatch: pytest.MonkeyPatch, ahead: int
 ) -> None:
@@ -182,6 +183,7 @@ def test_no_actor_is_far_ahead_of_the_oldest_that_is_not_done(
     assert 0 in said
 
 
+@pytest.mark.slow
 def test_environments_are_closed_in_the_end(cluster: RayCluster, tmp_path: Path) -> None:
     make = functools.partial(Closing, str(tmp_path))
     places = {process for process, _ in play(make, Echo, range(20), where, workers=cluster)}

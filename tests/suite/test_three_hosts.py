@@ -75,7 +75,7 @@ def test_an_evaluation_survives_the_death_of_its_driver_and_of_a_host(
     shutil.copytree(checkpoint_folder("pretrained", TASK), policy)
     out, partial = tmp_path / "there.json", tmp_path / f"there.json{progress_file.SUFFIX}"
     words = ["evaluate", "--policy", str(policy), "--task", TASK, "--out", str(out)]
-    words += ["--episodes", "40"]
+    words += ["--episodes", "30"]
     first = command(hosts, words)
     wait_for_trials(first, partial, 4)
     first.send_signal(signal.SIGKILL)
@@ -86,7 +86,7 @@ def test_an_evaluation_survives_the_death_of_its_driver_and_of_a_host(
     wait_for_trials(again, partial, kept + 4)
     hosts.kill("two")
     finish(again)
-    here = protocol.evaluate(str(policy), TASK, tmp_path / "here.json", episodes=40)
+    here = protocol.evaluate(str(policy), TASK, tmp_path / "here.json", episodes=30)
     there = result_file.load(out)
     assert there.episodes == here.episodes
     logs = [result_file.actions_path(tmp_path / name).read_bytes() for name in ("here.json", out)]
