@@ -32,7 +32,7 @@ lint: .venv/.up-to-date  ## ruff and mypy
 	@$(PY) -m mypy
 
 lock:  ## resolve requirements.lock anew
-	uv pip compile setup.cfg --extra learn --extra dev --override scripts/lock.overrides \
+	uv pip compile setup.cfg --extra learn --extra ray --extra dev --override scripts/lock.overrides \
 	  --universal --python-version 3.12 --upgrade --quiet \
 	  --no-annotate --no-header --no-emit-index-url --no-emit-find-links -o requirements.lock
 
@@ -43,5 +43,5 @@ clean:  ## remove .venv, runs and caches
 	rm -rf .venv runs build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-.venv/.up-to-date: requirements.lock setup.cfg scripts/make_venv.sh
+.venv/.up-to-date: requirements.lock setup.cfg scripts/make_venv.sh integrations/lerobot_env_hvs/pyproject.toml
 	@scripts/make_venv.sh

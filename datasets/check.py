@@ -28,6 +28,7 @@ from hvs_suite.datasets.moments import Moments, compare, compare_all, merge, sam
 from hvs_suite.datasets.reader import DamagedFileError, Place
 from hvs_suite.datasets.resimulation import resimulate
 from hvs_suite.errors import DatasetError, HvsError, ScenarioError
+from hvs_suite.executor import Workers
 from hvs_suite.names import shown
 from hvs_suite.registry import find
 from hvs_suite.rollout import play
@@ -91,7 +92,8 @@ class Report:
 def check_dataset(
     root: Path,
     *,
-    workers: int = 1,
+    metadata: DatasetMetadata | None = None,
+    workers: Workers = 1,
     pictures: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Report:
@@ -99,7 +101,8 @@ def check_dataset(
 
     Args:
         root: The dataset.
-        workers: Processes that share the episodes.
+        metadata: Origin to hold it against; the dataset's own by default.
+        workers: Processes that share the episodes, or others elsewhere that see the same folder.
         pictures: Also draw every frame again and compare; decoding is checked in any case.
         progress: Called after each episode with the number checked and of all.
 
@@ -113,7 +116,7 @@ def check_dataset(
     if not (root / "meta").exists() and not (root / METADATA_FILE).exists():
         raise DatasetError(f"{root} holds no dataset; name the root of one made by 'hvs record'")
     try:
-        metadata = read_metadata(root)
+        metadata = metadata or read_metadata(root)
         spec = find(metadata.task).with_options(metadata.options)
         features = dataset_features(spec)
     except HvsError as error:
@@ -129,11 +132,11 @@ def check_dataset(
     sentences = _read_sentences(root, damage)
     damage += _check_order(places)
     damage += _check_videos(info, places)
-    unreadable, in_files = _check_files(root, places)
+    unreadable, in_files = _check_files(root, places, features)
     damage += in_files
     sound = [place for place in places if place.file not in unreadable]
     job = CheckEpisode(
-        root,
+        root.resolve(),
         metadata,
         {place.episode: place for place in sound},
         features,
@@ -170,9 +173,10 @@ def check_dataset(
         # A feature that some episode could not give has no statistics to compare.
         whole = {name: each for name, each in merged.items() if len(each) == checked}
         damage += _check_statistics(root, info, features, whole)
-        wanted = list(dict.fromkeys(said[episode] for episode in sorted(said)))
-        if sentences and wanted and sentences != wanted:
-            what = f"{sentences} is not what the episodes are about, {wanted}"
+        # A recording lists them as they come; LeRobot's tools do not keep the order.
+        wanted = sorted(set(said.values()))
+        if sentences and wanted and sorted(sentences) != wanted:
+            what = f"{sorted(sentences)} is not what the episodes are about, {wanted}"
             damage.append(Damage(reader.TASKS, None, None, what))
     return Report(checked, frames, tuple(sorted(set(damage), key=_order)))
 
@@ -510,7 +514,9 @@ def _check_videos(info: Mapping[str, Any], places: Iterable[Place]) -> list[Dama
     return []
 
 
-def _check_files(root: Path, places: Iterable[Place]) -> tuple[set[str], list[Damage]]:
+def _check_files(
+    root: Path, places: Iterable[Place], features: Iterable[str]
+) -> tuple[set[str], list[Damage]]:
     """Every data file is there and readable, and holds the rows listed and no others.
 
     Returns:
@@ -535,7 +541,7 @@ def _check_files(root: Path, places: Iterable[Place]) -> tuple[set[str], list[Da
         stray = set(numbers.ravel().tolist()) - set(episodes)
         for episode in sorted(stray)[:_LISTED_DAMAGE]:
             damage.append(Damage(file, episode, None, "is listed nowhere in this file"))
-        wanted = set(_columns_of(root)) - set(inside[0].videos)
+        wanted = {*features, *LEROBOT_COLUMNS} - set(inside[0].videos)
         lacking = sorted(wanted - set(table.column_names))
         if lacking:
             damage.append(Damage(file, None, None, f"lacks the columns {', '.join(lacking)}"))
@@ -544,13 +550,6 @@ def _check_files(root: Path, places: Iterable[Place]) -> tuple[set[str], list[Da
         if name not in listed:
             damage.append(Damage(name, None, None, "belongs to no episode"))
     return unreadable, damage
-
-
-def _columns_of(root: Path) -> list[str]:
-    """Columns that every data file must have."""
-    metadata = read_metadata(root)
-    features = dataset_features(find(metadata.task).with_options(metadata.options))
-    return [*features, *LEROBOT_COLUMNS]
 
 
 def _check_statistics(

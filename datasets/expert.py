@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.cell import robot
+from hvs_suite.datasets.insertion import GuardedInsertion
 from hvs_suite.datasets.planner import Planner
 from hvs_suite.errors import OptionError
 from hvs_suite.rollout import Observation
@@ -45,7 +46,8 @@ class Expert:
                 "task with action_mode='joint_position'."
             )
         self._env = env
-        self._planner = Planner(spec.control_period_s, plain=plain)
+        self._planner = Planner(spec.control_period_s, plain=plain, embodiment=spec.embodiment)
+        self._insertion = GuardedInsertion(spec.control_period_s, spec.embodiment)
         self._period_s = spec.control_period_s
         self._delay_s = spec.latency_steps * spec.control_period_s
 
@@ -76,6 +78,8 @@ class Expert:
     ) -> FloatArray:
         """Where the set point (7,) shall be at the end of the control step that acts next."""
         goal = self._goal_in(0.0)
+        if goal.standoff_m < 0.0:  # below the surface: there is a hole
+            return self._insertion.next_set_point(q, velocity, set_point, goal)
         if not goal.velocity.any():
             return self._planner.next_set_point(q, velocity, goal)
         return self._planner.follow(q, velocity, set_point, self._goal_in)

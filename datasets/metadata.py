@@ -85,7 +85,8 @@ def read_metadata(root: str | Path) -> DatasetMetadata:
     path = Path(root) / METADATA_FILE
     if not os.path.lexists(path):
         raise DatasetError(
-            f"{root} holds no {METADATA_FILE}: name the root of a dataset made by 'hvs record'"
+            f"{root} holds no {METADATA_FILE}: name the root of a dataset made by 'hvs record'; to "
+            f"one that LeRobot's tools made of such, 'hvs attach {root} --origin DIR' gives it back"
         )
     content = read_object(path, error=DatasetError, within=Path(root), most=_MOST_BYTES)
     if content.get("format") != FORMAT:

@@ -24,6 +24,7 @@ import numpy.typing as npt
 import ruckig
 
 from hvs_suite.cell import robot
+from hvs_suite.cell.embodiment import BARE_ARM, Embodiment
 from hvs_suite.cell.kinematics import Kinematics, away_from_stops, kinematics
 from hvs_suite.cell.solid import Solid, obstacle_distance
 from hvs_suite.datasets.roadmap import Roadmap
@@ -47,7 +48,7 @@ TIE_BREAK_S = 0.01
 
 LEAD_S = 0.025
 """How far the set point runs ahead of the motion (s): a little less than the joints' lag, tuned for
-the fewest steps. More overshoots the goal, less arrives late."""
+the fewest steps. More overshoots the goal, less arrives late. A compliant arm has a longer lag."""
 
 _CROWDED_SHARE = 0.5
 _ROOM_S = 1.5
@@ -111,10 +112,13 @@ def stopping_travel_time(
 
 
 def _stopping_travel_time(
-    q: FloatArray, velocity: FloatArray, goals: FloatArray
+    q: FloatArray,
+    velocity: FloatArray,
+    goals: FloatArray,
+    acceleration: FloatArray = robot.JOINT_ACCELERATION_RAD_S2,
 ) -> tuple[FloatArray, FloatArray]:
     """``stopping_travel_time`` for goals (n, m), joint by joint along the first axis."""
-    a = robot.JOINT_ACCELERATION_RAD_S2[: len(q), None]
+    a = acceleration[: len(q), None]
     w = robot.JOINT_SPEED_RAD_S[: len(q), None]
     way = goals - q[:, None]
     v = np.minimum(np.maximum(velocity[:, None], -w), w)
@@ -137,11 +141,19 @@ class Planner:
             arrives first at full speed. Which of some two thousand postures is the soonest jumps
             with every little change of where the arm stands; two can be learned
             (docs/experiments/simple-ways.md). They cost three steps.
+        embodiment: The robot, whose tip is what goals are for.
     """
 
-    def __init__(self, period_s: float, *, plain: bool = False) -> None:
-        self._kinematics: Kinematics = kinematics()
+    def __init__(
+        self,
+        period_s: float,
+        *,
+        plain: bool = False,
+        embodiment: Embodiment = BARE_ARM,
+    ) -> None:
+        self._kinematics: Kinematics = kinematics(embodiment)
         self._period_s = period_s
+        self._lead_s = LEAD_S * embodiment.slowness
         self._plain = plain
         self._n_swivel = PLAIN_SWIVELS if plain else N_SWIVEL
         self._goal_key: bytes = b""
@@ -158,7 +170,9 @@ class Planner:
         self._ruckig = ruckig.Ruckig(7)
         self._input = ruckig.InputParameter(7)
         self._input.max_velocity = list(robot.JOINT_SPEED_RAD_S)
-        self._input.max_acceleration = list(robot.JOINT_ACCELERATION_RAD_S2)
+        # A set point that jerks makes a compliant arm swing.
+        self._acceleration = robot.JOINT_ACCELERATION_RAD_S2 / embodiment.slowness
+        self._input.max_acceleration = list(self._acceleration)
         # No jerk limit: within a control step the cell's set point moves at constant speed, so a
         # ramp that is shorter than the step cannot be executed, and a longer one costs time.
 
@@ -324,8 +338,8 @@ class Planner:
             self._roadmaps[key] = Roadmap(self._clearance, goal)
         roadmap = self._roadmaps[key]
         nodes = roadmap.nodes[:, :6].T
-        times, effort = _stopping_travel_time(q[:6], velocity[:6], nodes)
-        rest = _where_braking_ends(q, velocity)[6]
+        times, effort = _stopping_travel_time(q[:6], velocity[:6], nodes, self._acceleration)
+        rest = self._where_braking_ends(q, velocity)[6]
         last = min(max(rest, -robot.JOINT_RANGE_RAD[6]), robot.JOINT_RANGE_RAD[6])
         for node in roadmap.candidates(times + TIE_BREAK_S * effort):
             yield np.append(node[:6], last)
@@ -387,7 +401,7 @@ class Planner:
         joints = family[:, :6].T
 
         def price(goals: FloatArray) -> FloatArray:
-            times, effort = _stopping_travel_time(q[:6], velocity[:6], goals)
+            times, effort = _stopping_travel_time(q[:6], velocity[:6], goals, self._acceleration)
             return times + TIE_BREAK_S * effort + (_crowding(goals) if self._more_follow else 0.0)
 
         bound = (np.abs(joints - q[:6, None]) / _FULL_SPEED).max(axis=0)
@@ -405,7 +419,7 @@ class Planner:
 
     def _point_ahead(self, motion: ruckig.Trajectory) -> FloatArray:
         """Where a motion is at the end of the control step (7,); the arm trails its set point."""
-        ahead = min(self._period_s + LEAD_S, motion.duration)
+        ahead = min(self._period_s + self._lead_s, motion.duration)
         return np.asarray(motion.at_time(ahead)[0])
 
     def _first_clear(
@@ -447,7 +461,7 @@ class Planner:
             tool_angle=q[6],
             n_swivel=24,
         )
-        rest = _where_braking_ends(q, velocity)
+        rest = self._where_braking_ends(q, velocity)
         rest = np.clip(rest, -robot.JOINT_RANGE_RAD, robot.JOINT_RANGE_RAD)
         upright = np.append(np.zeros(6), rest[6])
         nearest = above[np.argsort(np.abs(above - rest).max(axis=1))[:_MAX_ESCAPES]]
@@ -466,7 +480,7 @@ class Planner:
 
         A7 alone turns the free yaw, so it is left where it comes to rest.
         """
-        rest = _where_braking_ends(q, velocity)
+        rest = self._where_braking_ends(q, velocity)
         # Beside the two plain postures, the nearest would be another goal for every place that the
         # arm comes from.
         nearest = None if self._plain else self._nearest_posture(rest, goal)
@@ -484,12 +498,16 @@ class Planner:
         Distances are weighed by the accelerations, as travel times over short ways are. None far
         from the goal, where the family's one-degree grid is as good.
         """
-        _, flange = self._kinematics.flange_pose(q)
-        if math.hypot(*(goal.position - flange).tolist()) > PROJECTION_RANGE_M:
+        _, tip = self._kinematics.tip_pose(q)
+        if math.hypot(*(goal.position - tip).tolist()) > PROJECTION_RANGE_M:
             return None
         return self._kinematics.nearest_configuration(
             q, goal.position, goal.normal, robot.JOINT_ACCELERATION_RAD_S2
         )
+
+    def _where_braking_ends(self, q: FloatArray, velocity: FloatArray) -> FloatArray:
+        """Where each joint comes to rest (7,) if it brakes as hard as it can."""
+        return q + velocity * np.abs(velocity) / (2.0 * self._acceleration)
 
     def _motion(
         self, q: FloatArray, velocity: FloatArray, goal: FloatArray, *, together: bool = True
@@ -539,8 +557,3 @@ def _crowding(postures: FloatArray) -> FloatArray:
     share = np.abs(postures) / robot.JOINT_RANGE_RAD[:6, None]
     crowded = np.clip((share - _CROWDED_SHARE) / (1.0 - _CROWDED_SHARE), 0.0, 1.0)
     return np.asarray(_ROOM_S * (crowded**2).sum(axis=0))
-
-
-def _where_braking_ends(q: FloatArray, velocity: FloatArray) -> FloatArray:
-    """Where each joint comes to rest (7,) if it brakes as hard as it can."""
-    return q + velocity * np.abs(velocity) / (2.0 * robot.JOINT_ACCELERATION_RAD_S2)

@@ -42,7 +42,7 @@ _PLACE_COLUMNS = (
 )
 # Values of a frame in one feature: beyond any camera, and still a small file.
 _MOST_VALUES = 64 * 2**20
-_MOST_SENTENCES = 10
+_MOST_SENTENCES = 100
 _LONGEST_SENTENCE = 1000
 
 Picture = npt.NDArray[np.uint8]

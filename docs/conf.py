@@ -25,7 +25,8 @@ extensions = [
     "sphinx_copybutton",
     "sphinx_design",
 ]
-exclude_patterns = ["test-full.txt"]
+# The gallery stands for the table of tasks.
+exclude_patterns = ["test-full.txt", "tasks/README.md"]
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 3
 autodoc_member_order = "bysource"
@@ -38,7 +39,7 @@ napoleon_use_ivar = True
 suppress_warnings = ["ref.python"]
 
 _OUTSIDE = re.compile(
-    r"\[([^\]]+)\]\(\.\./((?:tasks|datasets|policies|eval|tests|hvs_suite)/[^)]*)\)"
+    r"\[([^\]]+)\]\(\.\./((?:(?:tasks|datasets|policies|eval|tests|hvs_suite)/|README)[^)]*)\)"
 )
 
 

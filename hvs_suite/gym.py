@@ -6,26 +6,32 @@
     env = gymnasium.make("hvs_suite/align-thesis-v1", split="train")
     observation, info = env.reset(options={"scenario": 0})
 
+The same tasks as ``hvs_suite/<name>-goal-v<version>`` are for hindsight replay, see `GoalEnv`.
+
 Importing this module loads neither MuJoCo nor a renderer; making an environment compiles the
 scene, and the renderer is made at the first reset, in whichever process that happens.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
+from gymnasium.envs.registration import WrapperSpec
 
 from hvs_suite.errors import OptionError
 from hvs_suite.registry import TASKS, load
+from hvs_suite.tasks.shared.goal import HEIGHT, LATERAL, POSITION, TILT, Goal, Tip, goal_errors
 
 if TYPE_CHECKING:
     import dm_env
 
 NAMESPACE = "hvs_suite"
 RENDER_SIDE_PX = 480
+_POSES = ("flange_position", "goal_position", "goal_normal")
+"""Of the preset ``state``: what a goal environment shows as goals."""
 
 Observation = dict[str, npt.NDArray[Any]]
 
@@ -182,6 +188,127 @@ def _space(spec: Any) -> spaces.Box:
     return spaces.Box(low, high, spec.shape, dtype)  # type: ignore[arg-type]
 
 
+class GoalEnv(TaskEnv):
+    """A named task for learners that replay in hindsight, such as Stable-Baselines3's HER.
+
+    Observations have the three parts that such learners ask for, all float32 and privileged:
+    ``observation``, the preset ``state`` without its goal, one vector; ``achieved_goal``, where the
+    tool's tip is; ``desired_goal``, where it has to be: each a position (3,) in m and the direction
+    of the tool's axis (3,), base frame.
+
+    The reward is 1 at the end of a control step inside the task's bounds, without a collision, and
+    0 elsewhere, because it has to follow from the two goals: of a hold of several steps and of
+    figures over an episode it knows nothing, ``info["is_success"]`` does.
+
+    Args:
+        task: Registered name, such as ``align-thesis``.
+        **options: As for `TaskEnv`, without ``observations`` and ``rewards``.
+
+    Raises:
+        OptionError: What the task bounds does not follow from where the tip is, or an option is one
+            of those two.
+    """
+
+    def __init__(self, task: str, **options: Any) -> None:
+        if fixed := sorted({"observations", "rewards"} & set(options)):
+            raise OptionError(f"a goal environment has {fixed[0]} of its own; leave them out")
+        super().__init__(task, observations="state", **options)
+        self._bounds = self._environment.spec.step_bounds
+        if foreign := sorted(set(self._bounds) - {POSITION, LATERAL, HEIGHT, TILT}):
+            raise OptionError(
+                f"{task} bounds {foreign[0]}, which does not follow from where the tip is; "
+                f"use {NAMESPACE}/{task}-v{self._environment.spec.version}"
+            )
+        pose = [self._spaces[name] for name in ("flange_position", "goal_normal")]
+        self._own = [name for name in self._spaces if name not in _POSES]
+        own = [self._spaces[name] for name in self._own]
+        self.observation_space = spaces.Dict(
+            {
+                "observation": _joined(own),
+                "achieved_goal": _joined(pose),
+                "desired_goal": _joined(pose),
+            }
+        )
+
+    def step(
+        self, action: npt.NDArray[np.float32]
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """As `TaskEnv.step`, with the reward of `compute_reward`."""
+        observation, _, terminated, truncated, info = super().step(action)
+        achieved, desired = observation["achieved_goal"], observation["desired_goal"]
+        reward = float(self.compute_reward(achieved, desired, info))
+        return observation, reward, terminated, truncated, info
+
+    def compute_reward(
+        self, achieved_goal: npt.NDArray[Any], desired_goal: npt.NDArray[Any], info: Any
+    ) -> npt.NDArray[np.float32]:
+        """Judge tips against goals, whichever step and episode either is from.
+
+        Args:
+            achieved_goal: Where the tip is, (6,) or (n, 6).
+            desired_goal: Where it has to be, as many.
+            info: Of the step, or (n,) of them; ``collision`` is read where it is there.
+
+        Returns:
+            1 inside the bounds, 0 elsewhere, () or (n,).
+        """
+        one = achieved_goal.ndim == 1
+        achieved = np.atleast_2d(achieved_goal).astype(np.float64)
+        desired = np.atleast_2d(desired_goal).astype(np.float64)
+        rewards = np.zeros(len(achieved), np.float32)
+        for i, known in enumerate([info] if one else info):
+            tip = Tip(achieved[i, :3], achieved[i, 3:])
+            errors = goal_errors(tip, Goal(desired[i, :3], -desired[i, 3:]))
+            inside = all(abs(errors[name]) <= bound for name, bound in self._bounds.items())
+            rewards[i] = inside and not known.get("collision", False)
+        return rewards[0] if one else rewards
+
+    def _observation(self, time_step: "dm_env.TimeStep") -> Observation:
+        state = super()._observation(time_step)
+        tip, goal = self._environment.tip(), self._environment.goal()
+        return {
+            "observation": np.concatenate([state[name] for name in self._own]),
+            "achieved_goal": np.concatenate([tip.position, tip.axis]).astype(np.float32),
+            "desired_goal": np.concatenate([goal.position, -goal.normal]).astype(np.float32),
+        }
+
+
+def _joined(parts: Sequence[spaces.Space[Any]]) -> spaces.Box:
+    """The space of several vectors in one."""
+    boxes = [cast(spaces.Box, part) for part in parts]
+    low, high = (np.concatenate([getattr(box, end) for box in boxes]) for end in ("low", "high"))
+    return spaces.Box(low, high, dtype=np.float32)
+
+
+class OwnTimeLimit(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
+    """Tells Gymnasium when the environment itself ends an episode: ``spec.max_episode_steps``.
+
+    Gymnasium's own limit stays away, so that a goal on the last step is an end of the task alone;
+    a shorter ``max_episode_steps`` of `gymnasium.make` puts it in between.
+
+    Args:
+        env: A `TaskEnv`, wrapped by `gymnasium.make`.
+
+    Raises:
+        OptionError: A longer limit was asked for, which the environment would not reach.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        gymnasium.utils.RecordConstructorArgs.__init__(self)
+        super().__init__(env)
+        task = cast(TaskEnv, env.unwrapped)
+        assert task.spec is not None
+        limit = task.environment.spec.time_limit_steps
+        # Before anything else: wrappers copy the spec when they are asked for it.
+        task.spec.max_episode_steps = limit
+        asked = None if env.spec is None else env.spec.max_episode_steps
+        if asked is not None and asked > limit:
+            raise OptionError(
+                f"max_episode_steps is {asked}, and {task.task} ends after {limit}; use "
+                f"time_limit_steps={asked}"
+            )
+
+
 class PixelsAgentPos(gymnasium.Wrapper[Any, Any, Observation, Any]):
     """The same environment with the observations that LeRobot's environments have.
 
@@ -212,12 +339,7 @@ class PixelsAgentPos(gymnasium.Wrapper[Any, Any, Observation, Any]):
         )
         view: dict[str, spaces.Space[Any]] = {"pixels": spaces.Dict(cameras)}
         if self._vectors:
-            boxes = [cast(spaces.Box, inner[name]) for name in self._vectors]
-            view["agent_pos"] = spaces.Box(
-                np.concatenate([box.low for box in boxes]),
-                np.concatenate([box.high for box in boxes]),
-                dtype=np.float32,
-            )
+            view["agent_pos"] = _joined([inner[name] for name in self._vectors])
         self._further = tuple(
             n for n in env.environment.spec.further_observations if n in inner.spaces
         )
@@ -250,10 +372,16 @@ def make_pixels_agent_pos(task: str, **options: Any) -> PixelsAgentPos:
 
 
 def register() -> None:
-    """Registers ``hvs_suite/<name>-v<version>`` for every named task; again does nothing."""
+    """Registers every named task, as it is and for hindsight replay; again does nothing."""
+    own_limit = WrapperSpec("OwnTimeLimit", "hvs_suite.gym:OwnTimeLimit", {})
     for name, spec in TASKS.items():
-        identifier = f"{NAMESPACE}/{name}-v{spec.version}"
-        if identifier not in gymnasium.registry:
-            # A string, so that registering imports nothing; time limit and order of calls are the
-            # environment's own.
-            gymnasium.register(identifier, "hvs_suite.gym:TaskEnv", kwargs={"task": name})
+        for kind, environment in (("", "TaskEnv"), ("-goal", "GoalEnv")):
+            identifier = f"{NAMESPACE}/{name}{kind}-v{spec.version}"
+            if identifier not in gymnasium.registry:
+                gymnasium.register(
+                    identifier,
+                    # A string, so that registering imports nothing.
+                    f"hvs_suite.gym:{environment}",
+                    additional_wrappers=(own_limit,),
+                    kwargs={"task": name},
+                )

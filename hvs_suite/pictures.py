@@ -316,7 +316,7 @@ def _ending(info: Mapping[str, Any]) -> tuple[str, tuple[int, int, int]] | None:
     if info["is_success"]:
         return "success", GREEN
     if info["collision"]:
-        return "collision", RED
+        return "overload" if info["overload"] else "collision", RED
     if info["truncated"]:
         return "time is up", RED
     return None

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import hvs_suite.tasks.align
 import hvs_suite.tasks.clutter
+import hvs_suite.tasks.insert
 import hvs_suite.tasks.sequence
 import hvs_suite.tasks.surface
 import hvs_suite.tasks.track  # noqa: F401 - each registers its tasks

@@ -15,10 +15,12 @@ from hvs_suite.registry import find
 from hvs_suite.rollout import PolicyFactory
 from hvs_suite.tasks.shared.spec import Spec
 
-BUILTIN = ("expert", "servo", "zero", "random")
+BUILTIN = ("expert", "servo", "push", "zero", "random")
 SHIPPED = ("pretrained", "finetuned")
 NAMES = (*BUILTIN, *SHIPPED)
 HERE = Path(__file__).resolve().parent
+LAST_CHECKPOINT = "checkpoints/last/pretrained_model"
+"""Where lerobot-train leaves the policy, below its output folder."""
 AS_NAMED: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -26,8 +28,8 @@ def policy_factory(spec: str, task: str, options: Mapping[str, Any] = AS_NAMED) 
     """Find a policy for a task.
 
     Args:
-        spec: ``expert``, ``servo``, ``zero``, ``random``, ``pretrained``, ``finetuned`` (the
-            weights shipped for the task), a checkpoint folder, a checkpoint's Hub id
+        spec: ``expert``, ``servo``, ``push``, ``zero``, ``random``, ``pretrained``, ``finetuned``
+            (the weights shipped for the task), a checkpoint folder, a checkpoint's Hub id
             (``owner/name``), or ``module:factory`` for code of one's own, which is imported and run
             once the policy is built (see `hvs_suite.policies.imported`).
         task: Named task.
@@ -69,6 +71,8 @@ def checkpoint_folder(spec: str, task: str) -> Path:
         return folder
     # Unlike pathlib's, this is just False for a name that cannot be.
     if os.path.isdir(spec):
+        if os.path.isdir(last := os.path.join(spec, LAST_CHECKPOINT)):
+            raise PolicyError(f"{spec} is a run of lerobot-train; name its policy, {last}")
         return Path(spec)
     if hub.NAME.fullmatch(spec):
         return hub.fetch(spec)
@@ -103,6 +107,10 @@ def _builtin(name: str) -> PolicyFactory:
         from hvs_suite.policies.servo import make_servo
 
         return make_servo
+    if name == "push":
+        from hvs_suite.policies.servo import make_push
+
+        return make_push
     from hvs_suite.policies import builtin
 
     return builtin.make_zero if name == "zero" else builtin.make_random

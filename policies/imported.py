@@ -1,5 +1,7 @@
 """Plays a person's own code: ``module:factory``, anything with ``reset`` and ``select_action``.
 
+How to write such a module: docs/your-policy.md.
+
 Importing the module runs its code with all the rights of whoever evaluates it. Nothing in the suite
 does so unless that name was typed on the command line or passed to `policy_factory`; a score is
 played in a process apart (see `hvs_suite.eval.serving.policy_process`).

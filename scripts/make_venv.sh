@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes .venv from requirements.lock and installs the project into it, editable.
+# Makes .venv from requirements.lock and installs the project and its LeRobot plugin into it, editable.
 #
 # Usage: scripts/make_venv.sh          (the Makefile calls it whenever the lock has changed)
 #        PYTHON=/path/to/python3.12 scripts/make_venv.sh
@@ -70,6 +70,7 @@ started=$SECONDS
 # --compile-bytecode: half a minute now; without it every process that loads LeRobot where Python may
 # not write bytecode would compile for 8 s, and every simulation worker for 3 s.
 "$uv" pip install --quiet --python .venv/bin/python --no-deps --compile-bytecode -r requirements.lock
-"$uv" pip install --quiet --python .venv/bin/python --no-deps --no-build-isolation --editable .
+"$uv" pip install --quiet --python .venv/bin/python --no-deps --no-build-isolation \
+  --editable . --editable integrations/lerobot_env_hvs
 touch .venv/.up-to-date
 say "done in $((SECONDS - started)) s"

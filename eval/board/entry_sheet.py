@@ -114,7 +114,7 @@ def _landings(entry: Entry) -> str:
         else f"The tolerance, {tolerance:g} mm, lies outside the picture."
     )
     if outside:
-        caption += f" So do {outside} of {len(rows)} landings."
+        caption += f" {outside} of {len(rows)} landings lie outside the picture."
     plot = plots.landing_plot(rows, radius, tolerance, "Landings around the target")
     return (
         f'<figure class="wide">{plot}<figcaption>{caption}<span class="key">'

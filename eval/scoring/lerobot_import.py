@@ -1,6 +1,6 @@
 """Takes the ``eval_info.json`` of ``lerobot-eval`` in, as what it is: a claim without proof.
 
-Such a file names neither task nor policy nor scenarios and logs no actions. It is kept with its
+Such a file names neither policy nor scenarios and logs no actions. It is kept with its
 successes under the same keys as ours, marked ``"verified": false``; it can be compared with others
 (``hvs compare``) and has no place on the board.
 """
@@ -14,6 +14,7 @@ import pydantic
 from hvs_suite import files, reading, registry, statistics
 from hvs_suite.errors import OptionError, ResultError
 from hvs_suite.eval.scoring.result_file import MOST_BYTES
+from hvs_suite.names import shown
 from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
 
 LEROBOT_SEED = 1000
@@ -122,8 +123,9 @@ class _Older(pydantic.BaseModel):
     per_episode: Annotated[list[_Episode], pydantic.Field(min_length=1)]
     overall: Annotated[_Overall, pydantic.Field(alias="aggregated")]
 
-    def episodes(self) -> list[_Episode]:
-        return self.per_episode
+    def of(self, task: str) -> tuple[list[_Episode], float]:
+        """Episodes of a task, and their success rate as claimed."""
+        return self.per_episode, self.overall.pc_success
 
 
 class _Metrics(pydantic.BaseModel):
@@ -139,39 +141,52 @@ class _Metrics(pydantic.BaseModel):
 
 
 class _Task(pydantic.BaseModel):
+    task_group: str = ""
     metrics: _Metrics
 
 
 class _Newer(pydantic.BaseModel):
     """What it writes now: columns, by task."""
 
-    per_task: Annotated[list[_Task], pydantic.Field(min_length=1, max_length=1)]
+    per_task: Annotated[list[_Task], pydantic.Field(min_length=1, max_length=100)]
+    per_group: dict[str, _Overall] = {}
     overall: _Overall
 
-    def episodes(self) -> list[_Episode]:
-        metrics = self.per_task[0].metrics
+    def of(self, task: str) -> tuple[list[_Episode], float]:
+        """Episodes of a task, and their success rate as claimed.
+
+        Raises:
+            ResultError: There are several tasks, and none or more than one has this name.
+        """
+        groups = [each.task_group for each in self.per_task]
+        alone = len(groups) == 1 and groups[0] not in registry.TASKS
+        named = [each for each in self.per_task if alone or each.task_group == task]
+        if len(named) != 1 or not (alone or task in self.per_group):
+            raise ResultError(f"holds {', '.join(map(shown, groups))}, and {task} not once")
+        metrics = named[0].metrics
         columns = metrics.successes, metrics.sum_rewards, metrics.max_rewards
-        return [
+        episodes = [
             _Episode(success=success, sum_reward=total, max_reward=largest)
             for success, total, largest in zip(*columns, strict=True)
         ]
+        return episodes, (self.overall if alone else self.per_group[task]).pc_success
 
 
 def read(
     path: Path, *, task: str, policy: str, split: str = TEST_SPLIT, seed: int = LEROBOT_SEED
 ) -> ImportedResult:
-    """Reads an ``eval_info.json`` that holds one task.
+    """Reads one task of an ``eval_info.json``.
 
     Args:
         path: The file.
-        task: Named task that was evaluated; the file does not say.
+        task: Named task that was evaluated; where the file holds several, that one of them.
         policy: Name for the policy; the file does not say.
         split: Split that was played.
         seed: First seed; the environment plays scenario seed (mod 1,000 on ``test``).
 
     Raises:
-        ResultError: The file is no such file, holds several tasks, or claims what its own rows do
-            not give.
+        ResultError: The file is no such file, holds several tasks and not this one, or claims what
+            its own rows do not give.
         OptionError: `seed` is negative.
         UnknownTaskError: There is no such task.
     """
@@ -179,14 +194,16 @@ def read(
     if seed < 0:
         raise OptionError(f"a seed is a whole number from 0 up, not {seed}")
     content = reading.read_object(path, error=ResultError, most=MOST_BYTES)
-    what = f"{path}: is no eval_info.json of one task, as lerobot-eval writes it"
+    what = f"{path}: is no eval_info.json, as lerobot-eval writes it"
     info: _Older | _Newer = (
         reading.validated(_Older, content, what, error=ResultError)
         if "per_episode" in content
         else reading.validated(_Newer, content, what, error=ResultError)
     )
-    episodes = info.episodes()
-    claimed = info.overall.pc_success
+    try:
+        episodes, claimed = info.of(task)
+    except ResultError as error:
+        raise ResultError(f"{path}: {error}") from None
     count = TEST_SCENARIOS if split == TEST_SPLIT else seed + len(episodes)
     rows = [
         ImportedRow(scenario=(seed + i) % count, **episode.model_dump())

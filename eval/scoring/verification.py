@@ -18,6 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from hvs_suite import registry, rollout
+from hvs_suite.datasets.lerobot_files import INFO
 from hvs_suite.errors import OptionError, ResultError
 from hvs_suite.eval.scoring import action_log, contender, result_file
 from hvs_suite.eval.scoring.result_file import EpisodeRow, Result
@@ -29,6 +30,7 @@ from hvs_suite.eval.scoring.trial import (
     play_trial,
     same_outcome,
 )
+from hvs_suite.executor import Workers
 from hvs_suite.names import shown
 from hvs_suite.policies import builtin, catalogue
 from hvs_suite.rollout import Action, Observation
@@ -125,7 +127,7 @@ def verify(
     *,
     sample: int | None = None,
     nonce: str | None = None,
-    workers: int = 1,
+    workers: Workers = 1,
     progress: Callable[[], None] | None = None,
 ) -> Verdict:
     """Checks a result file against its action log and the task.
@@ -135,7 +137,7 @@ def verify(
         sample: Scenarios to play again; None plays all.
         nonce: What the sample is drawn with, to repeat a draw; a new one by default, since whoever
             made the file must not know it.
-        workers: Processes that share the work.
+        workers: Processes that share the work, or others elsewhere.
         progress: Called after each scenario.
 
     Returns:
@@ -341,12 +343,14 @@ def results_in(paths: Sequence[Path]) -> list[Path]:
     """Returns the result files that are named or lie below the folders that are.
 
     Raises:
-        OptionError: There is none, or a path does not exist.
+        OptionError: There is none, or a path does not exist or is a dataset.
     """
     found: list[Path] = []
     for path in paths:
         if not path.exists():
             raise OptionError(f"{path} does not exist; name a result file or a folder of them")
+        if (path / INFO).exists():
+            raise OptionError(f"{path} is a dataset, no result; 'hvs check {path}' checks it")
         below = [Path(folder, name) for folder, _, names in os.walk(path) for name in names]
         found += sorted(f for f in below if f.suffix == ".json") if path.is_dir() else [path]
     if not found:

@@ -11,7 +11,7 @@ from hvs_suite.errors import PolicyError
 from hvs_suite.pictures import GREEN, Picture, as_rgb, resize, strip
 from hvs_suite.policies.checkpoints.files import read_config
 from hvs_suite.policies.checkpoints.loading import load_network
-from hvs_suite.policies.hvs.network import HvsNetwork, Sighting
+from hvs_suite.policies.network.network import HvsNetwork, Sighting
 from hvs_suite.rollout import (
     Action,
     Instructed,

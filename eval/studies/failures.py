@@ -30,7 +30,7 @@ from hvs_suite.tasks.shared.option_types import listed
 from hvs_suite.tasks.shared.spec import Spec
 
 if TYPE_CHECKING:
-    from hvs_suite.policies.hvs.network import HvsNetwork
+    from hvs_suite.policies.network.network import HvsNetwork
     from hvs_suite.tasks.shared.environment import Environment
 
 # An error that falls by a fifth in so many steps is on its way to the goal.
@@ -43,6 +43,7 @@ class Cause(enum.StrEnum):
 
     BROKEN = "the policy broke down"
     COLLIDED = "collided"
+    OVERLOADED = "pressed too hard"
     NOT_SEEN = "target not seen"
     MISPLACED = "seen but misplaced"
     SLOW = "too slow"
@@ -222,7 +223,7 @@ def cause_of(
     if row.failure is not None:
         return Cause.BROKEN
     if row.collision:
-        return Cause.COLLIDED
+        return Cause.OVERLOADED if spec.is_overload(row.errors) else Cause.COLLIDED
     if not seen_steps:
         return Cause.NOT_SEEN
     if estimate_error_mm is not None and estimate_error_mm > spec.tightest_tolerance_mm:

@@ -7,8 +7,8 @@ from dm_control import composer, mjcf
 
 from hvs_suite.cell import cameras
 from hvs_suite.cell.arm import Iiwa7
+from hvs_suite.cell.embodiment import Embodiment
 from hvs_suite.cell.marker import Marker
-from hvs_suite.cell.robot import PHYSICS_TIMESTEP_S
 from hvs_suite.cell.surface import Surface
 
 
@@ -27,6 +27,7 @@ class Cell(composer.Arena):
     def _build(
         self,
         *,
+        embodiment: Embodiment,
         surface: Surface,
         eih_fov_deg: float,
         eth_fov_deg: float,
@@ -36,6 +37,7 @@ class Cell(composer.Arena):
         """Builds the cell.
 
         Args:
+            embodiment: The robot.
             surface: What everything stands on.
             eih_fov_deg: As in ``Spec``; likewise the three below.
             eth_fov_deg: Field of view of the eye to hand.
@@ -44,9 +46,10 @@ class Cell(composer.Arena):
         """
         super()._build(name="cell")
         root = self.mjcf_model
-        root.option.timestep = PHYSICS_TIMESTEP_S
+        root.option.timestep = embodiment.timestep_s
         root.option.integrator = "implicitfast"
-        root.option.impratio = 1.0
+        root.option.impratio = embodiment.impratio
+        root.option.noslip_iterations = embodiment.noslip_iterations
         # A fixed scale: near plane 5 mm (the surface is 50 mm from the lens at the goal), far 15 m.
         root.statistic.extent = 1.0
         root.statistic.center = [0, 0, 0.4]
@@ -83,11 +86,11 @@ class Cell(composer.Arena):
         )
         self.surface = surface
         self.attach(self.surface)
-        self.robot = Iiwa7()
+        self.robot = Iiwa7(embodiment)
         self.attach(self.robot)
         self.markers: list[Marker] = []
         self.eih: Any = cameras.add_eye_in_hand(
-            self.robot.flange_body, self.robot.flange, eih_fov_deg
+            self.robot.flange_body, self.robot.flange, eih_fov_deg, embodiment
         )
         self.eth: Any = cameras.add_eye_to_hand(root, eth_position_m, eth_look_at_m, eth_fov_deg)
 

@@ -17,6 +17,8 @@ from dm_control import mjcf
 from dm_control.composer.observation import observable
 from dm_env import specs
 
+from hvs_suite.cell.embodiment import Embodiment
+
 FloatArray = npt.NDArray[np.float64]
 
 # Rotation from MuJoCo's camera frame to the optical frame, and back.
@@ -69,6 +71,26 @@ def extrinsics(position: FloatArray, rotation: FloatArray) -> FloatArray:
     transform[:3, :3] = (rotation @ _OPTICAL).T
     transform[:3, 3] = -transform[:3, :3] @ position
     return transform
+
+
+def extrinsics_of_hand(
+    rotation: FloatArray, position: FloatArray, embodiment: Embodiment
+) -> FloatArray:
+    """Transform from the base frame to the optical frame of the eye in the hand.
+
+    Args:
+        rotation: Of the flange frame in the base frame, (3, 3).
+        position: Of the flange face's centre, (3,) m, base frame.
+        embodiment: Says where on the flange the eye is.
+
+    Returns:
+        T, (4, 4), as in `extrinsics`.
+    """
+    axes, place = embodiment.hand_eye
+    T = np.eye(4)
+    T[:3, :3] = (rotation @ axes).T
+    T[:3, 3] = -T[:3, :3] @ (position + rotation @ place)
+    return T
 
 
 def project(points: npt.ArrayLike, K: FloatArray, T: FloatArray) -> FloatArray:
@@ -147,23 +169,27 @@ def to_grey(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     return ((image.astype(np.uint32) @ weights + 500) // 1000).astype(np.uint8)[..., None]
 
 
-def add_eye_in_hand(flange_body: Any, flange_site: Any, fov_deg: float) -> Any:
-    """Mount the eye-in-hand camera at the flange face, looking out along the tool axis.
+def add_eye_in_hand(
+    flange_body: Any, flange_site: Any, fov_deg: float, embodiment: Embodiment
+) -> Any:
+    """Mount the eye-in-hand camera where the embodiment has it.
 
     Args:
         flange_body: MJCF body that carries the flange.
         flange_site: MJCF site at the flange face, z outward.
         fov_deg: Field of view (deg).
+        embodiment: Says where; see `Embodiment.hand_eye`.
 
     Returns:
         The MJCF camera, named ``eih``.
     """
-    # MuJoCo cameras look along -z, hence y and z are turned over about the flange's x axis.
+    axes, place = embodiment.hand_eye
+    # MuJoCo cameras look along -z, hence y and z are turned over about the optical x axis.
     return flange_body.add(
         "camera",
         name="eih",
-        pos=flange_site.pos,
-        xyaxes=[1, 0, 0, 0, -1, 0],
+        pos=flange_site.pos + place,
+        xyaxes=[*axes[:, 0], *(0.0 - axes[:, 1])],
         fovy=fov_deg,
     )
 

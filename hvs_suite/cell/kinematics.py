@@ -1,7 +1,8 @@
 """Kinematics and dynamics of the iiwa: Pinocchio on the cell's own MJCF, closed-form inverse.
 
 All poses are in the robot's base frame (m, rad). The flange frame is the site ``flange``: origin
-at the flange face centre, +z out along the tool axis.
+at the flange face centre, +z out along the tool axis. Positions of goals are the *tip*'s: the
+tool's, which lies on that axis, or the flange itself where there is no tool.
 """
 
 import functools
@@ -15,6 +16,7 @@ import numpy.typing as npt
 import pinocchio as pin
 
 from hvs_suite.cell import robot
+from hvs_suite.cell.embodiment import BARE_ARM, Embodiment
 from hvs_suite.errors import OutputError
 
 FloatArray = npt.NDArray[np.float64]
@@ -139,12 +141,13 @@ class Kinematics:
         OutputError: There is no room for a temporary file.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, embodiment: Embodiment = BARE_ARM) -> None:
+        self._wrist_to_tip_m = robot.WRIST_TO_FLANGE_M + embodiment.tool_length_m
         # Pinocchio reads MJCF from a file only.
         try:
             with tempfile.TemporaryDirectory() as folder:
                 path = pathlib.Path(folder, "iiwa7.xml")
-                path.write_text(robot.robot_mjcf(), encoding="utf-8")
+                path.write_text(robot.robot_mjcf(embodiment), encoding="utf-8")
                 self.model = pin.buildModelFromMJCF(str(path))
                 self.geometry = pin.buildGeomFromMJCF(
                     self.model, str(path), pin.GeometryType.COLLISION
@@ -156,7 +159,8 @@ class Kinematics:
             ) from error
         if self.model.nq != len(robot.JOINT_NAMES):
             raise RuntimeError("Pinocchio read no robot from the cell's MJCF")
-        self._flange = self.model.getFrameId("flange")
+        self._flange = self.model.getFrameId(robot.FLANGE)
+        self._tip = self.model.getFrameId(robot.tip_name(embodiment))
         self._data = self.model.createData()
         self._scene = self._with_surface()
         self._scene_data = self._scene.createData()
@@ -215,18 +219,25 @@ class Kinematics:
 
     def flange_pose(self, q: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Rotation (3, 3) and position (3,) in m of the flange in the base frame."""
+        return self._pose(q, self._flange)
+
+    def tip_pose(self, q: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Rotation (3, 3) and position (3,) in m of the tool's tip; the flange's without a tool."""
+        return self._pose(q, self._tip)
+
+    def _pose(self, q: npt.ArrayLike, frame: int) -> tuple[FloatArray, FloatArray]:
         pin.forwardKinematics(self.model, self._data, np.asarray(q, dtype=np.float64))
-        placement = pin.updateFramePlacement(self.model, self._data, self._flange)
+        placement = pin.updateFramePlacement(self.model, self._data, frame)
         return np.array(placement.rotation), np.array(placement.translation)
 
     def jacobian(self, q: npt.ArrayLike) -> FloatArray:
-        """Jacobian (6, 7) of the flange: linear (m/rad) over angular rows, in base axes."""
+        """Jacobian (6, 7) of the tip: linear (m/rad) over angular rows, in base axes."""
         return np.asarray(
             pin.computeFrameJacobian(
                 self.model,
                 self._data,
                 np.asarray(q, dtype=np.float64),
-                self._flange,
+                self._tip,
                 pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
             ).copy()
         )
@@ -288,7 +299,7 @@ class Kinematics:
         turn by less than a full circle, so no angle has a second value within its range.
 
         Args:
-            position: Flange face centre (3,) in m.
+            position: Of the tip (3,) in m.
             normal: Outward surface normal (3,); the flange's +z is its opposite.
             yaw: Turn about the flange's +z from :func:`tool_frame` (n,) in rad, paired with
                 ``swivel``.
@@ -319,7 +330,7 @@ class Kinematics:
         :meth:`goal_configurations_at_tool_angle`, which needs no grid of yaws.
 
         Args:
-            position: Flange face centre (3,) in m.
+            position: Of the tip (3,) in m.
             normal: Outward surface normal (3,).
             n_yaw: Evenly spaced yaws over the circle.
             n_swivel: Evenly spaced elbow places over the circle.
@@ -345,7 +356,7 @@ class Kinematics:
         With ``tool_angle`` where A7 is now, this holds the fastest configurations of all yaws.
 
         Args:
-            position: Flange face centre (3,) in m.
+            position: Of the tip (3,) in m.
             normal: Outward surface normal (3,).
             tool_angle: Angle of A7 (rad) within its range.
             n_swivel: Evenly spaced elbow places over the circle.
@@ -363,7 +374,7 @@ class Kinematics:
         """The family of a goal at yaw 0, row by row the same elbow places and shapes for any goal.
 
         Args:
-            position: Flange face centre (3,) in m.
+            position: Of the tip (3,) in m.
             normal: Outward surface normal (3,).
             n_swivel: Evenly spaced elbow places over the circle.
 
@@ -380,7 +391,7 @@ class Kinematics:
 
         Args:
             q: Joint angles (7,) in rad, not far from the goal.
-            position: Flange face centre (3,) in m.
+            position: Of the tip (3,) in m.
             normal: Outward surface normal (3,); yaw about it is free.
             weight: How readily each joint turns (7,): distances are measured in q / weight.
 
@@ -389,9 +400,9 @@ class Kinematics:
         """
         across = _across(normal.tobytes())
         for _ in range(_ITERATIONS):
-            R, flange = self.flange_pose(q)
+            R, tip = self.tip_pose(q)
             # Rotation vector that takes the flange axis onto the inward normal.
-            error = np.concatenate([position - flange, across @ _cross(R[:, 2], -normal)])
+            error = np.concatenate([position - tip, across @ _cross(R[:, 2], -normal)])
             if np.abs(error).max() < 1e-9:
                 break
             jacobian = self.jacobian(q)
@@ -411,7 +422,7 @@ class Kinematics:
         Shape by shape, each for all swivels in order; empty where out of reach.
         """
         R_goal = tool_frame(normal)
-        wrist = np.asarray(position, dtype=np.float64) - robot.WRIST_TO_FLANGE_M * R_goal[:, 2]
+        wrist = np.asarray(position, dtype=np.float64) - self._wrist_to_tip_m * R_goal[:, 2]
         line = wrist - _SHOULDER
         reach = float(np.linalg.norm(line))
         upper, fore = robot.SHOULDER_TO_ELBOW_M, robot.ELBOW_TO_WRIST_M
@@ -474,7 +485,9 @@ def _within_ranges(q: FloatArray) -> FloatArray:
     return q[(np.abs(q) <= robot.JOINT_RANGE_RAD).all(axis=1)]
 
 
-@functools.cache
-def kinematics() -> Kinematics:
-    """The process's one :class:`Kinematics`, built at first use."""
-    return Kinematics()
+def kinematics(embodiment: Embodiment = BARE_ARM) -> Kinematics:
+    """The process's one :class:`Kinematics` of an embodiment, built at first use."""
+    return _kinematics(embodiment)
+
+
+_kinematics = functools.cache(Kinematics)

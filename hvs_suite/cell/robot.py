@@ -17,12 +17,16 @@ surfaces, objects  ``SCENE_BIT``         0
 """
 
 import dataclasses
+import math
 from collections.abc import Iterable
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 from dm_control import mjcf
+
+from hvs_suite.cell.embodiment import BARE_ARM, Embodiment
+from hvs_suite.cell.tool import TIP, add_tool
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -54,7 +58,7 @@ JOINT_HEIGHTS_M: tuple[float, ...] = (0.150, 0.340, 0.550, 0.740, 0.950, 1.140, 
 """Height of each link frame above the base at the zero pose; A2, A4, A6 are pivot centres."""
 FLANGE_HEIGHT_M = BASE_TO_SHOULDER_M + SHOULDER_TO_ELBOW_M + ELBOW_TO_WRIST_M + WRIST_TO_FLANGE_M
 
-PHYSICS_TIMESTEP_S = 1.0 / 240.0
+PHYSICS_TIMESTEP_S = BARE_ARM.timestep_s
 """The timestep that the gains below are tuned for, with integrator ``implicitfast``."""
 ARMATURE_KG_M2 = 0.1
 """Rotor inertia seen through the gears; KUKA gives none."""
@@ -68,6 +72,7 @@ DAMPING_NM_S_RAD: FloatArray = np.array([670.0, 1300.0, 298.0, 286.0, 17.2, 17.2
 LAG_S: FloatArray = DAMPING_NM_S_RAD / STIFFNESS_NM_RAD
 """Each joint trails a moving set point by kv / kp (s)."""
 
+FLANGE = "flange"
 ROBOT_BIT = 1
 SCENE_BIT = 2
 SHELL_GROUP = 2
@@ -273,12 +278,12 @@ def _add_inertial(body: Any, link: _Link) -> None:
     body.add("inertial", mass=link.mass, pos=link.centre, fullinertia=link.inertia)
 
 
-def robot_tree() -> mjcf.RootElement:
-    """Builds the bare robot: bodies, joints, actuators, collision geoms and the flange site."""
+def robot_tree(embodiment: Embodiment = BARE_ARM) -> mjcf.RootElement:
+    """Builds the bare robot: bodies, joints, actuators, collision geoms, flange site and tool."""
     root = mjcf.RootElement(model="iiwa7")
     root.compiler.angle = "radian"
     root.compiler.autolimits = True
-    root.option.timestep = PHYSICS_TIMESTEP_S
+    root.option.timestep = embodiment.timestep_s
     root.option.integrator = "implicitfast"
     collision = root.default.add("default", dclass="collision").geom
     collision.contype = ROBOT_BIT
@@ -315,8 +320,8 @@ def robot_tree() -> mjcf.RootElement:
             "intvelocity",
             name=joint_name,
             joint=joint_name,
-            kp=STIFFNESS_NM_RAD[i],
-            kv=DAMPING_NM_S_RAD[i],
+            kp=STIFFNESS_NM_RAD[i] * embodiment.stiffness,
+            kv=DAMPING_NM_S_RAD[i] * math.sqrt(embodiment.stiffness),
             # The joint's limit alone would do for the physics, but implicitfast leaves out the
             # damping of a saturated drive only where the actuator itself is limited.
             forcerange=(-torque, torque),
@@ -328,10 +333,18 @@ def robot_tree() -> mjcf.RootElement:
         links = ["base"] + [f"link_{j + 1}" for j in range(i + 1)]
         for other in links[-3:-1]:
             root.contact.add("exclude", body1=other, body2=name)
-    body.add("site", name="flange", pos=(0, 0, round(FLANGE_HEIGHT_M - height, 6)), group=4)
+    face = (0, 0, round(FLANGE_HEIGHT_M - height, 6))
+    body.add("site", name=FLANGE, pos=face, group=4)
+    if embodiment.tool is not None:
+        add_tool(root, body, embodiment, face)
     return root
 
 
-def robot_mjcf() -> str:
+def tip_name(embodiment: Embodiment) -> str:
+    """Name of the site at the tool's tip, which is the flange's where there is no tool."""
+    return FLANGE if embodiment.tool is None else TIP
+
+
+def robot_mjcf(embodiment: Embodiment = BARE_ARM) -> str:
     """The bare robot (no shells, no assets) as MJCF text that MuJoCo and Pinocchio both load."""
-    return str(robot_tree().to_xml_string())
+    return str(robot_tree(embodiment).to_xml_string())

@@ -117,7 +117,7 @@ def certify(
 
     import hvs_suite
     from hvs_suite.datasets.expert import make_expert
-    from hvs_suite.registry import family_of
+    from hvs_suite.registry import family_of, find
     from hvs_suite.rollout import rollout
     from hvs_suite.tasks.shared import certificate
     from hvs_suite.tasks.shared.scenario import TEST_SPLIT
@@ -144,4 +144,9 @@ def certify(
             mean_steps=float(np.mean(steps)) if steps else float("nan"),
         )
     )
+    checks += [
+        certificate.limit_check(metric, [episode.errors[metric.name] for episode in episodes])
+        for metric in find(task).with_options(options).metrics
+        if metric.is_limit
+    ]
     return certificate.Certificate(task, digest, scenarios, tuple(checks))

@@ -15,7 +15,7 @@ class ImportLerobot:
 
     Attributes:
         file: The eval_info.json.
-        task: Named task that was evaluated; the file does not say.
+        task: Named task that was evaluated; of several in the file, one.
         policy: Name for the policy; the file does not say.
         out: File to write (JSON), replaced if it exists.
         split: Split that was played.

@@ -11,10 +11,13 @@ import inspect
 import io
 import logging
 import os
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
+
+import tyro
 
 from hvs_suite.cli import streams
 from hvs_suite.errors import HvsError, OptionError
@@ -28,6 +31,7 @@ COMMANDS = {
     "view": "hvs_suite.cli.view:View",
     "record": "hvs_suite.cli.record:Record",
     "check": "hvs_suite.cli.check:Check",
+    "attach": "hvs_suite.cli.attach:Attach",
     "replay": "hvs_suite.cli.replay:Replay",
     "share": "hvs_suite.cli.share:Share",
     "fetch": "hvs_suite.cli.fetch:Fetch",
@@ -46,10 +50,13 @@ COMMANDS = {
     "study": "hvs_suite.cli.study:Study",
     "certify": "hvs_suite.cli.certify:Certify",
     "doctor": "hvs_suite.cli.doctor:Doctor",
+    "completion": "hvs_suite.cli.completion:Completion",
     "demo": "hvs_suite.cli.demo:Demo",
     "reproduce": "hvs_suite.cli.reproduce:Reproduce",
 }
 
+PARSER = (tyro.conf.FlagCreatePairsOff, tyro.conf.UseAppendAction)
+"""How tyro reads every command."""
 USER_ERROR = 2
 INTERRUPTED = 130
 
@@ -120,22 +127,25 @@ def parse(arguments: Sequence[str]) -> Command:
     if name in ("-h", "--help"):
         print(_overview())
         raise SystemExit(0)
+    if name == "--version":
+        import hvs_suite
+
+        print(f"hvs {hvs_suite.__version__}")
+        raise SystemExit(0)
     if name not in COMMANDS:
         close = difflib.get_close_matches(name, COMMANDS, n=1)
         hint = f"did you mean {close[0]}?" if close else f"choose from {', '.join(COMMANDS)}"
         complain(f"unknown command {name!r}; {hint}")
         raise SystemExit(USER_ERROR)
 
-    import tyro
-
     errors = io.StringIO()
     try:
         with contextlib.redirect_stderr(errors):
             command: Command = tyro.cli(
-                _load(COMMANDS[name]),
+                load(COMMANDS[name]),
                 prog=f"hvs {name}",
                 args=rest,
-                config=(tyro.conf.FlagCreatePairsOff, tyro.conf.UseAppendAction),
+                config=PARSER,
             )
     except SystemExit as end:
         if end.code in (0, None):
@@ -173,8 +183,8 @@ def _import_plugins(arguments: Sequence[str]) -> Sequence[str]:
     return arguments
 
 
-def _load(where: str) -> Any:
-    """Import the dataclass named ``module:Class``."""
+def load(where: str) -> Any:
+    """Import the dataclass named ``module:Class``, as `COMMANDS` has it."""
     module, _, name = where.partition(":")
     return getattr(importlib.import_module(module), name)
 
@@ -188,24 +198,37 @@ def _overview() -> str:
         "",
     ]
     for name, where in COMMANDS.items():
-        summary = (inspect.getdoc(_load(where)) or "").partition("\n")[0]
+        summary = (inspect.getdoc(load(where)) or "").partition("\n")[0]
         lines.append(f"  {name:<16}{summary}")
     lines += [
         "",
         "'hvs COMMAND --help' explains the options of a command; --plugin imports a module that",
-        "registers tasks of your own.",
+        "registers tasks of your own; 'hvs --version' prints the version.",
     ]
     return "\n".join(lines)
 
 
 def _reason(box: str) -> str:
-    """Shorten the parser's framed complaint to its first paragraph, without options' help texts."""
-    found: list[str] = []
+    """Shorten the parser's framed complaint to one paragraph, without options' help texts.
+
+    A word that it does not know explains what it misses, and is told with the nearest that it
+    knows.
+    """
+    paragraphs: list[list[str]] = [[]]
     for line in box.splitlines()[1:]:
-        text = line.strip().strip("│")
-        if not text.strip(" ─╰╯"):
-            break
+        # Tyro draws its frame in ASCII where the terminal has no more.
+        text = line.strip().strip("│|")
+        if not text.strip(" ─╰╯-+"):
+            paragraphs.append([])
         # Names of options are indented once, their help texts twice.
-        if not text.startswith(" " * 9):
-            found.append(text.strip())
-    return " ".join(found) or "the command line makes no sense"
+        elif not text.startswith(" " * 9):
+            paragraphs[-1].append(text.strip())
+    told = [" ".join(paragraph) for paragraph in paragraphs if paragraph]
+    unknown = next((each for each in told if each.startswith("Unrecognized options")), None)
+    if unknown is None:
+        return next(iter(told), "the command line makes no sense")
+    known = [each for each in told if each.startswith(("Missing from", "Perhaps you meant"))]
+    flag, near = re.compile(r"--[a-z][a-z-]*"), []
+    for typed in flag.findall(unknown):
+        near += difflib.get_close_matches(typed, flag.findall(" ".join(known)), n=1)
+    return f"{unknown}; did you mean {' and '.join(near)}?" if near else unknown

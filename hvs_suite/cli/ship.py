@@ -6,12 +6,10 @@ from typing import Annotated
 
 import tyro
 
-from hvs_suite.errors import OptionError
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Ship:
-    """Share a trained policy: write its model card, then copy it or push it to the Hub.
+    """Share a trained policy: write its model card, and copy it or push it to the Hub.
 
     Takes the folder that hvs pretrain made: weights, settings and how the training went, nothing
     else. The Hub's token is taken from HF_TOKEN or an earlier login, and neither printed nor
@@ -19,7 +17,7 @@ class Ship:
 
     Attributes:
         policy: Checkpoint folder; without --to-folder the card goes into it as README.md.
-        to_folder: Folder to copy to, such as policies/pretrained/align-thesis.
+        to_folder: Folder to copy to, such as policies/pretrained/align-thesis; the card goes there.
         to_hub: Repository to push to, user/name.
         private: Make the repository private.
         result: Result file of hvs evaluate to put into the card; give it several times for several.
@@ -39,8 +37,6 @@ class Ship:
         from hvs_suite.eval.scoring import result_file
         from hvs_suite.policies.checkpoints import card, files, hub
 
-        if self.to_folder is None and self.to_hub is None:
-            raise OptionError("say where to: --to-folder DIR or --to-hub user/name")
         if self.to_hub is not None:
             check_repository(self.to_hub)
         results = [result_file.load(path).model_dump(mode="json") for path in self.result]

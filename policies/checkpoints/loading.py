@@ -30,8 +30,8 @@ from hvs_suite.policies.checkpoints.files import (
     read_settings,
     read_steps,
 )
-from hvs_suite.policies.hvs.compiled import CompiledNetwork
-from hvs_suite.policies.hvs.network import (
+from hvs_suite.policies.network.compiled import CompiledNetwork
+from hvs_suite.policies.network.network import (
     IMAGE_PREFIX,
     N_JOINTS,
     RESIDUAL_BOUND,
@@ -338,7 +338,7 @@ def _lerobot(folder: Path) -> tuple[Decide, Callable[[], None]]:
         from lerobot.policies.factory import get_policy_class, make_pre_post_processors
     except ImportError as error:
         raise PolicyError("LeRobot is missing; install hvs-suite[learn]") from error
-    import hvs_suite.policies.hvs.configuration_hvs  # noqa: F401 - registers the type
+    import hvs_suite.policies.hvs  # noqa: F401 - registers the type
 
     try:
         config = PreTrainedConfig.from_pretrained(folder, local_files_only=True)

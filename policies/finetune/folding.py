@@ -11,7 +11,7 @@ from hvs_suite.errors import PolicyError
 from hvs_suite.files import replacing
 from hvs_suite.policies.checkpoints.files import read_config
 from hvs_suite.policies.checkpoints.loading import NETWORK_PREFIX, STANDARD_STEPS, load_network
-from hvs_suite.policies.hvs.network import HvsNetwork
+from hvs_suite.policies.network.network import HvsNetwork
 from hvs_suite.policies.trained_for import trained_for
 from hvs_suite.tasks.shared.spec import Spec
 

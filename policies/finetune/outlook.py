@@ -11,8 +11,8 @@ from torch import Tensor
 
 from hvs_suite.cell.robot import LAG_S
 from hvs_suite.policies.finetune.stage import COMING, GOAL, JOINTS, NORMAL, SENT
-from hvs_suite.policies.hvs import geometry
-from hvs_suite.policies.hvs.network import CONTROL_PERIOD_S, N_JOINTS, HvsNetwork
+from hvs_suite.policies.network import geometry
+from hvs_suite.policies.network.network import CONTROL_PERIOD_S, N_JOINTS, HvsNetwork
 
 OUTLOOK_SIZE = 20
 FINE = 25.0

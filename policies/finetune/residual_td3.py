@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from hvs_suite.policies.finetune.outlook import OUTLOOK_SIZE, Outlook
 from hvs_suite.policies.finetune.stage import FEATURES, PRIVILEGED
-from hvs_suite.policies.hvs.network import make_residual, normed_layers
+from hvs_suite.policies.network.network import make_residual, normed_layers
 
 N_TARGET_CRITICS = 2
 WARM_UP_UPDATES = 4

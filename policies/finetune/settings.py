@@ -4,7 +4,7 @@ import dataclasses
 import math
 
 from hvs_suite.errors import OptionError
-from hvs_suite.policies.hvs.network import RESIDUAL_BOUND
+from hvs_suite.policies.network.network import RESIDUAL_BOUND
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

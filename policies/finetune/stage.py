@@ -22,8 +22,8 @@ from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S, after_comma
 from hvs_suite.policies.checkpoints.loading import network_inputs
 from hvs_suite.policies.finetune.folding import load_base
 from hvs_suite.policies.finetune.settings import Settings
-from hvs_suite.policies.hvs.compiled import CompiledFeatures
-from hvs_suite.policies.hvs.network import N_JOINTS
+from hvs_suite.policies.network.compiled import CompiledFeatures
+from hvs_suite.policies.network.network import N_JOINTS
 from hvs_suite.policies.rl.curriculum import Curriculum
 from hvs_suite.policies.rl.journal import OUTCOMES, Journal
 from hvs_suite.rollout import one_torch_thread
@@ -181,7 +181,7 @@ class MakeStage:
         options: Task options that differ from it.
         levels: Further options, of each level of the curriculum.
         split: Stream of scenes.
-        base: Checkpoint that plays.
+        folder: Checkpoint that plays.
         settings: Of the run.
         seed: Of the run.
         part: Which of the environments it is.
@@ -191,7 +191,7 @@ class MakeStage:
     options: Mapping[str, Any]
     levels: list[dict[str, Any]]
     split: str
-    base: Path
+    folder: str
     settings: Settings
     seed: int
     part: int = 0
@@ -203,7 +203,7 @@ class MakeStage:
         # The monitor inside: it sees the task's own rewards.
         stage = ResidualStage(
             Monitor(env, info_keywords=OUTCOMES),
-            self.base,
+            Path(self.folder),
             settings.bound,
             settings.shaping,
             settings.gamma,

@@ -8,7 +8,7 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 from lerobot.utils.constants import OBS_STATE
 
-from hvs_suite.policies.hvs.network import (
+from hvs_suite.policies.network.network import (
     ERROR_SCALE,
     IMAGE_PREFIX,
     N_JOINTS,

@@ -13,13 +13,13 @@ from torch import Tensor
 
 from hvs_suite.errors import DatasetError, OutputError, first_line
 from hvs_suite.policies.hvs.configuration_hvs import HvsConfig
-from hvs_suite.policies.hvs.dataset import (
+from hvs_suite.policies.network.dataset import (
     GOAL_NORMAL,
     GOAL_POSITION,
     TARGET_PREFIX,
     calibration_of,
 )
-from hvs_suite.policies.hvs.network import (
+from hvs_suite.policies.network.network import (
     IMAGE_PREFIX,
     MEMORY,
     Decision,
@@ -30,7 +30,7 @@ from hvs_suite.policies.hvs.network import (
     sighting_loss,
     target_loss,
 )
-from hvs_suite.policies.hvs.rehearsal import drawn_sightings
+from hvs_suite.policies.network.rehearsal import drawn_sightings
 
 logger = logging.getLogger(__name__)
 
@@ -140,7 +140,7 @@ class HvsPolicy(PreTrainedPolicy):
     def rehearse(
         self, batch: dict[str, Tensor], lesson: Lesson, generator: torch.Generator
     ) -> Tensor:
-        """Loss of the head on frames without images, see `hvs_suite.policies.hvs.rehearsal`.
+        """Loss of the head on frames without images, see `hvs_suite.policies.network.rehearsal`.
 
         Args:
             batch: As in `supervise`, images left out.

@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from hvs_suite.errors import DatasetError
-from hvs_suite.policies.hvs.dataset import (
+from hvs_suite.policies.imitation.frame_cache import Frames, OnFrames, cached_frames, read_rows
+from hvs_suite.policies.imitation.remembered import remembered
+from hvs_suite.policies.network.dataset import (
     EPISODE,
     GOAL_NORMAL,
     GOAL_POSITION,
@@ -19,10 +21,8 @@ from hvs_suite.policies.hvs.dataset import (
     calibrate_on,
     read_columns,
 )
-from hvs_suite.policies.hvs.geometry import Calibration
-from hvs_suite.policies.hvs.network import IMAGE_PREFIX, MEMORY, STATE
-from hvs_suite.policies.imitation.frame_cache import Frames, OnFrames, cached_frames, read_rows
-from hvs_suite.policies.imitation.remembered import remembered
+from hvs_suite.policies.network.geometry import Calibration
+from hvs_suite.policies.network.network import IMAGE_PREFIX, MEMORY, STATE
 
 # Held out from training to measure the loss on; whole episodes, so that no neighbour frame leaks.
 HELD_OUT_SHARE = 0.05

@@ -13,7 +13,7 @@ import torch
 
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, set_point_after
 from hvs_suite.datasets.features import ACTION_EXECUTED
-from hvs_suite.policies.hvs.geometry import (
+from hvs_suite.policies.network.geometry import (
     Calibration,
     FlangeMotion,
     flange_motion,
@@ -21,7 +21,7 @@ from hvs_suite.policies.hvs.geometry import (
     seen_from_afar,
     seen_from_hand,
 )
-from hvs_suite.policies.hvs.network import (
+from hvs_suite.policies.network.network import (
     CONTROL_PERIOD_S,
     HEIGHT_SUMS,
     N_JOINTS,

@@ -13,9 +13,9 @@ from hvs_suite.datasets.features import ACTION_EXECUTED
 from hvs_suite.errors import OptionError, PolicyError
 from hvs_suite.policies.checkpoints.files import read_config
 from hvs_suite.policies.checkpoints.loading import load_network, weights_digest
-from hvs_suite.policies.hvs.dataset import Manifest, calibration_of
-from hvs_suite.policies.hvs.network import IMAGE_PREFIX, STATE, Eye
 from hvs_suite.policies.imitation.frame_cache import fingerprint
+from hvs_suite.policies.network.dataset import Manifest, calibration_of
+from hvs_suite.policies.network.network import IMAGE_PREFIX, STATE, Eye
 from hvs_suite.policies.trained_for import trained_for
 from hvs_suite.registry import find
 
@@ -39,7 +39,7 @@ class Settings:
         inputs: What the policy is given, of ``eih``, ``eth`` and ``joints``; None for all.
         episodes: Learn from the first so many demonstrations alone; None from all.
         rehearsal_frames: Frames a step that the head alone learns from, without their images; see
-            `hvs_suite.policies.hvs.rehearsal`.
+            `hvs_suite.policies.network.rehearsal`.
         keypoint_weight: Weight of the supervision by ``privileged.*``; 0 trains on actions alone.
         error_scale: See `HvsConfig`.
         eyes: SHA-256 of the weights whose eyes it begins with; None for fresh ones.

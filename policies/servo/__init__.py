@@ -1,8 +1,10 @@
 """``servo``: classical hybrid visual servoing, as a practitioner would write it; no learning.
 
-One file a kind of task; `make_servo` is the one place that knows which family takes which.
+One file a kind of task; `make_servo` and `make_push` are the one place that knows which family
+takes which.
 """
 
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 from hvs_suite.errors import PolicyError
@@ -26,6 +28,7 @@ def make_servo(env: Playground) -> Policy:
     """
     from hvs_suite.policies.servo.among_others import AmongOthersServo
     from hvs_suite.policies.servo.changing_target import ChangingTargetServo
+    from hvs_suite.policies.servo.insertion import InsertionServo
     from hvs_suite.policies.servo.moving_target import MovingTargetServo
     from hvs_suite.policies.servo.sloped_target import SlopedTargetServo
     from hvs_suite.policies.servo.still_target import StillTargetServo
@@ -36,9 +39,25 @@ def make_servo(env: Playground) -> Policy:
         "track": MovingTargetServo,
         "clutter": AmongOthersServo,
         "surface": SlopedTargetServo,
+        "insert": InsertionServo,
     }
+    return _made("servo", servos, env)
+
+
+def make_push(env: Playground) -> Policy:
+    """``push``: as ``servo``, but straight down where it sees the hole; what sight alone is worth.
+
+    Raises:
+        PolicyError: There is nothing to insert.
+    """
+    from hvs_suite.policies.servo.insertion import PushServo
+
+    return _made("push", {"insert": PushServo}, env)
+
+
+def _made(name: str, servos: Mapping[str, type[Any]], env: Playground) -> Policy:
     spec = env.spec
     if spec.family not in servos:
-        raise PolicyError(f"servo does not know tasks of family {spec.family}")
+        raise PolicyError(f"{name} does not know tasks of family {spec.family}")
     servo: Policy = servos[spec.family](spec)
     return servo

@@ -72,6 +72,7 @@ class SlopedTargetServo(StillTargetServo):
         lean = math.sin(math.radians(spec.tilt_deg[1]))
         self._highest_m = spec.raise_m[1] + SIDE_M * lean + 0.02
         self._ring = Ring(spec.mark_ring_m, spec.n_marks, spec.sag_m)
+        self._standoff_m = spec.standoff_m
         tolerance_m = 1e-3 * spec.tightest_tolerance_mm
         # A slope that is off shifts the flange as well.
         slope_rad = min(math.radians(spec.tilt_tolerance_deg), tolerance_m / spec.standoff_m)
@@ -131,11 +132,11 @@ class SlopedTargetServo(StillTargetServo):
             hover = np.array([*slope.place[:2], self._highest_m + _HOVER_M])
             return self._over(within_reach(hover)), None
         if slope.fit is None:
-            near = max(_NEAR_RINGS * self._ring.radius_m, 1.5 * self._variant.standoff_m)
+            near = max(_NEAR_RINGS * self._ring.radius_m, 1.5 * self._standoff_m)
             return Goal(slope.place, _UP, near * (1.0 + 0.3 * self._misses)), None
         normal = slope.fit.pose.normal
         self._planner.avoid((_around(slope.place, normal),))
-        goal = Goal(slope.place, normal, self._variant.standoff_m)
+        goal = Goal(slope.place, normal, self._standoff_m)
         self._decide(q, goal)
         if self._is_going:
             return goal, None
@@ -172,9 +173,9 @@ class SlopedTargetServo(StillTargetServo):
         for _ in range(_N_SIDES):
             lean = math.cos(self._side) * x + math.sin(self._side) * y
             towards = math.cos(_LEAN_RAD) * normal + math.sin(_LEAN_RAD) * lean
-            look = Goal(place, towards, self._variant.standoff_m + _FARTHER_M)
+            look = Goal(place, towards, self._standoff_m + _FARTHER_M)
             there = np.linalg.norm(p - look.position) < _THERE_M and -R[:, 2] @ towards > _THERE_COS
-            is_near = self._is_near(q, look, Goal(place, normal, self._variant.standoff_m))
+            is_near = self._is_near(q, look, Goal(place, normal, self._standoff_m))
             if is_near and not there:
                 break
             if not is_near:

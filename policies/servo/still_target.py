@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from hvs_suite.cell.cameras import extrinsics, intrinsics, look_at
+from hvs_suite.cell.cameras import extrinsics, extrinsics_of_hand, intrinsics, look_at
 from hvs_suite.cell.kinematics import kinematics, travel_time
 from hvs_suite.cell.robot import (
     BASE_TO_SHOULDER_M,
@@ -43,7 +43,7 @@ from hvs_suite.policies.servo.target_search import SPACING_M, TargetSearch
 from hvs_suite.rollout import Observation
 from hvs_suite.tasks.shared.detection import find_discs
 from hvs_suite.tasks.shared.goal import Goal
-from hvs_suite.tasks.shared.placing import PlacingSpec
+from hvs_suite.tasks.shared.placing import RingSpec
 
 if TYPE_CHECKING:
     pass
@@ -67,7 +67,9 @@ class StillTargetServo:
 
     Attributes:
         max_misses: How often the eye in the hand may miss a target that it should see.
-        look_height_m: How high the flange hovers while it looks for a target (m).
+        look_height_m: How high the tip hovers while it looks for a target (m).
+        measures_height: Whether the target's apparent size shows how far away it is.
+        face_m: Height of the target's face above the surface (m).
 
     Args:
         spec: The task's parameters.
@@ -78,15 +80,18 @@ class StillTargetServo:
 
     max_misses = 6
     look_height_m = 0.30
+    face_m = 0.0
+    measures_height = True
 
-    def __init__(self, spec: PlacingSpec) -> None:
+    def __init__(self, spec: RingSpec) -> None:
         _check(spec)
         self._variant = spec
-        self._kinematics = kinematics()
+        self._embodiment = spec.embodiment
+        self._kinematics = kinematics(spec.embodiment)
         self._belief = Belief(spec.control_period_s)
-        self._planner = Planner(spec.control_period_s)
+        self._planner = Planner(spec.control_period_s, embodiment=spec.embodiment)
         self._sight = Sight(spec.target_diameter_m, spec.ring_m)
-        self._search = TargetSearch(self._kinematics, spec.ring_m, spec.target_diameter_m)
+        self._search = TargetSearch(kinematics(), spec.ring_m, spec.target_diameter_m)
         names = spec.observed
         self._has_eih, self._has_eth = "eih" in names, "eth" in names
         self._eih_K = intrinsics(spec.eih_resolution, spec.eih_fov_deg)
@@ -141,14 +146,13 @@ class StillTargetServo:
             turn = float(np.arccos(np.clip(0.5 * (np.trace(self._hand[0].T @ R) - 1), -1, 1)))
             self._estimate.move(float(np.linalg.norm(p - self._hand[1])), turn)
         self._hand = (R, p)
-        # The optical frame of the eye in the hand is the flange frame.
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = R.T, -R.T @ p
+        T = extrinsics_of_hand(R, p, self._embodiment)
         seen = self._sighting(observation["eih"], self._eih_K, T) if self._has_eih else None
         if seen is not None:
             self._misses = 0
             self._estimate.see_eih(seen)
-            self._estimate.see_height(seen, float(-R[2, 2]))
+            if self.measures_height:
+                self._estimate.see_height(seen, float(-R[2, 2]))
         elif self._has_eih:
             self._notice_a_miss(T)
         if self._has_eth and not self._estimate.in_hand_sigma_m < _SETTLED_SIGMA_M:
@@ -169,7 +173,7 @@ class StillTargetServo:
     def _sighting(self, image: npt.NDArray[Any], K: FloatArray, T: FloatArray) -> Sighting | None:
         """The first patch of a picture that can be the target."""
         for disc in find_discs(image):
-            sighting = self._sight.sighting(disc, K, T, self._estimate.surface_m)
+            sighting = self._sight.sighting(disc, K, T, self._face_height_m)
             if sighting is not None:
                 return sighting
         return None
@@ -203,14 +207,14 @@ class StillTargetServo:
         if not self._estimate.is_known:
             return facing_down(self._look_out(q)), None
         place, sigma = self._estimate.place()
-        standoff, surface = self._variant.standoff_m, self._estimate.surface_m
+        standoff, face = self._variant.look_from_m, self._face_height_m
         # Misplaced by a few millimetres, a target at the edge would be out of reach.
-        goal = within_reach(np.array([*place, standoff + surface]))
+        goal = self._within_reach(np.array([*place, standoff + face]))
         height = self._height_to_see(sigma)
         if height == standoff:
             return facing_down(goal), None
-        hover = np.array([*place, min(height, _MAX_HOVER_M) + surface])
-        return facing_down(within_reach(hover)), facing_down(goal)
+        hover = np.array([*place, min(height, _MAX_HOVER_M) + face])
+        return facing_down(self._within_reach(hover)), facing_down(goal)
 
     def _height_to_see(self, sigma_m: float) -> float:
         """How far above the surface the eye in the hand is sure to see the target (m).
@@ -222,7 +226,7 @@ class StillTargetServo:
         if self._has_eih:
             radius = 0.5 * self._variant.target_diameter_m + _SIGMAS * sigma_m
             needed = radius / self._half_view
-        return max(self._variant.standoff_m, needed) * (1.0 + 0.3 * self._misses)
+        return max(self._variant.look_from_m, needed) * (1.0 + 0.3 * self._misses)
 
     def _look_out(self, q: FloatArray) -> FloatArray:
         """Where to hover to look at what nobody has looked at, (3,) m.
@@ -238,7 +242,7 @@ class StillTargetServo:
         choices = hidden[np.unique(np.linspace(0, len(hidden) - 1, _LOOK_CHOICES).astype(int))]
         for choice in choices:
             covered = hidden[_near(hidden, choice, radius)]
-            goal = within_reach(np.array([*covered[:, :2].mean(axis=0), self.look_height_m]))
+            goal = self._within_reach(np.array([*covered[:, :2].mean(axis=0), self.look_height_m]))
             family = self._kinematics.goal_configurations_at_tool_angle(goal, _UP, q[6])
             if not len(family):
                 continue
@@ -247,8 +251,17 @@ class StillTargetServo:
             if worth > best:
                 best, self._look = worth, goal
         if self._look is None:
-            self._look = within_reach(np.array([*choices[0, :2], self.look_height_m]))
+            self._look = self._within_reach(np.array([*choices[0, :2], self.look_height_m]))
         return self._look
+
+    @property
+    def _face_height_m(self) -> float:
+        """Height of the target's face in the encoders' frame (m)."""
+        return self.face_m + self._estimate.surface_m
+
+    def _within_reach(self, tip: FloatArray) -> FloatArray:
+        """The nearest place at the same height over which the tool can face down, (3,) m."""
+        return within_reach(tip, self._embodiment.tool_length_m)
 
 
 def _near(points: FloatArray, place: FloatArray, radius: float) -> npt.NDArray[np.bool_]:
@@ -262,9 +275,9 @@ def facing_down(position: FloatArray) -> Goal:
     return Goal(np.array([position[0], position[1], 0.0]), _UP, float(position[2]))
 
 
-def within_reach(goal: FloatArray) -> FloatArray:
+def within_reach(goal: FloatArray, tool_length_m: float = 0.0) -> FloatArray:
     """The nearest place at the same height over which the arm can face down, (3,) m."""
-    rise = goal[2] + WRIST_TO_FLANGE_M - BASE_TO_SHOULDER_M
+    rise = goal[2] + tool_length_m + WRIST_TO_FLANGE_M - BASE_TO_SHOULDER_M
     longest = SHOULDER_TO_ELBOW_M + ELBOW_TO_WRIST_M - _REACH_MARGIN_M
     outer = np.sqrt(max(longest**2 - rise**2, 0.0))
     inner = np.sqrt(max(_SHORTEST_REACH_M**2 - rise**2, 0.0))
@@ -273,14 +286,14 @@ def within_reach(goal: FloatArray) -> FloatArray:
     return np.array([goal[0] * scale, goal[1] * scale, goal[2]])
 
 
-def _calibration_sigma(spec: PlacingSpec) -> float:
+def _calibration_sigma(spec: RingSpec) -> float:
     """What the published accuracy of the eye-to-hand calibration means on the surface (m)."""
     distance = float(np.linalg.norm(np.subtract(spec.eth_position_m, spec.eth_look_at_m)))
     turn = np.radians(spec.eth_rotation_noise_deg)
     return float(np.hypot(spec.eth_position_noise_m, distance * turn))
 
 
-def _check(spec: PlacingSpec) -> None:
+def _check(spec: RingSpec) -> None:
     """Refuse what the method does not do, in a sentence."""
     names = spec.observed
     if not {"eih", "eth"} & set(names) or not {"joint_positions", "joint_velocities"} <= set(names):
@@ -294,5 +307,5 @@ def _check(spec: PlacingSpec) -> None:
         for name, channels in (("eih", spec.eih_channels), ("eth", spec.eth_channels))
     ):
         raise PolicyError("servo tells the target by its colour; use cameras with 3 channels")
-    if getattr(spec, "surface", "flat") != "flat" or spec.marker != "disc":
+    if getattr(spec, "surface", "flat") != "flat" or getattr(spec, "marker", "disc") != "disc":
         raise PolicyError("servo knows discs on flat surfaces alone")

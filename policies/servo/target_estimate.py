@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from hvs_suite.cell.cameras import project
 from hvs_suite.cell.marker import HALF_THICKNESS_M
-from hvs_suite.tasks.shared.detection import DRAWN_AREA, Disc
+from hvs_suite.tasks.shared.detection import DRAWN_AREA, Disc, intersect, outline
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -32,9 +32,6 @@ _OUTLIER_M = 0.01
 _OUTLIER_SIGMA = 6.0
 _MAX_OUTLIERS = 2
 _UPRIGHT_COS = float(np.cos(np.radians(4.0)))
-
-_CIRCLE = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
-_RIM = np.stack([np.cos(_CIRCLE), np.sin(_CIRCLE), np.zeros(len(_CIRCLE))], axis=1)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -58,62 +55,21 @@ class Sighting:
     diameter_px: float
 
 
-def intersect(uv: FloatArray, K: FloatArray, T: FloatArray, height_m: float) -> FloatArray | None:
-    """Where the ray of a pixel meets a level plane.
-
-    Args:
-        uv: Pixels, (n, 2).
-        K: Intrinsics, (3, 3) px.
-        T: Extrinsics, (4, 4), base to optical frame.
-        height_m: Height of the plane (m).
-
-    Returns:
-        Places (n, 2) in m, or None where a ray does not come down on the plane.
-    """
-    rays = np.concatenate([(uv - K[:2, 2]) / [K[0, 0], K[1, 1]], np.ones((len(uv), 1))], axis=1)
-    down = rays @ T[:3, :3]
-    eye = -T[:3, :3].T @ T[:3, 3]
-    if eye[2] <= height_m or (down[:, 2] > -0.02 * np.linalg.norm(down, axis=1)).any():
-        return None
-    reach = (height_m - eye[2]) / down[:, 2]
-    return np.asarray(eye[:2] + reach[:, None] * down[:, :2])
-
-
-def outline(
-    place: FloatArray, diameter_m: float, K: FloatArray, T: FloatArray, height_m: float
-) -> tuple[float, FloatArray] | None:
-    """Area (px^2) and centre of area (2,) px of a disc's picture; None where it is not in front.
-
-    The centre of the picture is not the picture of the centre: perspective shifts it by up to a
-    millimetre for a near, tilted disc.
-    """
-    rim = np.array([*place, height_m]) + 0.5 * diameter_m * _RIM
-    seen = project(rim, K, T)
-    if (seen[:, 2] < 0.01).any():
-        return None
-    u, v = seen[:, 0] - seen[0, 0], seen[:, 1] - seen[0, 1]
-    u_next, v_next = np.roll(u, -1), np.roll(v, -1)
-    cross = u * v_next - u_next * v
-    twice = float(cross.sum())
-    if abs(twice) < 1e-9:
-        return None
-    centre = np.array([((u + u_next) @ cross), ((v + v_next) @ cross)]) / (3.0 * twice)
-    # A polygon of 24 sides stands for the circle: put its missing area back.
-    circle = (2.0 * np.pi / len(_CIRCLE)) / np.sin(2.0 * np.pi / len(_CIRCLE))
-    return 0.5 * abs(twice) * circle, centre + seen[0, :2]
-
-
 class Sight:
     """Judges patches by what the target would look like there.
 
     Args:
         diameter_m: Diameter of the target (m).
         ring_m: Inner and outer radius of the ring of targets (m).
+        hole_share: Share of the disc's area that a hole in its middle takes.
     """
 
-    def __init__(self, diameter_m: float, ring_m: tuple[float, float]) -> None:
+    def __init__(
+        self, diameter_m: float, ring_m: tuple[float, float], hole_share: float = 0.0
+    ) -> None:
         self._diameter_m = diameter_m
         self._ring_m = ring_m
+        self._hole_share = hole_share
 
     def sighting(
         self, disc: Disc, K: FloatArray, T: FloatArray, surface_m: float
@@ -133,9 +89,10 @@ class Sight:
         expected = outline(place[0], self._diameter_m, K, T, height)
         if expected is None:
             return None
-        area, drawn_centre = expected[0] * DRAWN_AREA, expected[1]
+        area, drawn_centre = expected[0] * DRAWN_AREA * (1.0 - self._hole_share), expected[1]
         middle = project(np.array([*place[0], height]), K, T)[:2]
-        centre = disc.centre - (drawn_centre - middle)
+        # Perspective shifts a disc's centre with its area, so what a hole leaves the more.
+        centre = disc.centre - (1.0 + self._hole_share) * (drawn_centre - middle)
         # The point and its neighbours one pixel to the right and below: place and derivative.
         places = intersect(np.add(centre, [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), K, T, height)
         if places is None:

@@ -84,6 +84,7 @@ class ArmTask(composer.Task):
         self.spec = spec
         self.family = family
         self._cell = Cell(
+            embodiment=spec.embodiment,
             surface=family.surface(),
             eih_fov_deg=spec.eih_fov_deg,
             eth_fov_deg=spec.eth_fov_deg,
@@ -153,6 +154,7 @@ class ArmTask(composer.Task):
         self._actuators = np.array(physics.bind(robot.actuators).element_id, int).ravel()
         self._act = physics.model.actuator_actadr[self._actuators].copy()
         self._flange = int(physics.bind(robot.flange).element_id)
+        self._tip = int(physics.bind(robot.tip).element_id)
         self._flange_body = int(physics.bind(robot.flange_body).element_id)
         self.cameras = {
             name: cameras.Camera(
@@ -197,7 +199,8 @@ class ArmTask(composer.Task):
         self._goal_configurations = None
         if "joint_space" in self.spec.rewards:
             goal = self.goal()
-            self._goal_configurations = kinematics().goal_configurations(goal.position, goal.normal)
+            model = kinematics(self.spec.embodiment)
+            self._goal_configurations = model.goal_configurations(goal.position, goal.normal)
         mujoco.mj_kinematics(physics.model.ptr, data)
         self._errors = self.family.measure(self.tip(physics)) | self.family.at_reset()
 
@@ -361,7 +364,8 @@ class ArmTask(composer.Task):
         Returns:
             ``task`` and ``split`` (str), ``scenario`` (int), ``is_success``, ``success_once``
             (inside tolerance at any control step's end), ``steps_to_goal`` (int, None without
-            success), ``collision``, ``truncated`` (bool),
+            success), ``collision``, ``truncated`` (bool), ``overload`` (bool: the collision that
+            ended the episode was a breach of a limit on a metric, such as too much force),
             ``n_inside`` (control steps held so far), ``n_clipped`` (actions clipped) and
             ``errors``: every metric of the spec at the end of the last control step, by name.
         """
@@ -374,6 +378,7 @@ class ArmTask(composer.Task):
             "steps_to_goal": self._steps_to_goal,
             "collision": self._collision,
             "truncated": self._truncated,
+            "overload": self._collision and self.spec.is_overload(self._errors),
             "n_inside": self._n_inside,
             "n_clipped": self._n_clipped,
             "errors": self.errors,
@@ -387,7 +392,7 @@ class ArmTask(composer.Task):
         """Where the tool tip is now."""
         data = physics.data.ptr
         # Copies: MuJoCo's arrays change under the hands of whoever keeps them.
-        return Tip(data.site_xpos[self._flange].copy(), data.site_xmat[self._flange][2::3].copy())
+        return Tip(data.site_xpos[self._tip].copy(), data.site_xmat[self._tip][2::3].copy())
 
     def distance_m(self, physics: mjcf.Physics) -> float:
         """How far the tip is from its goal (m)."""
@@ -471,7 +476,7 @@ class ArmTask(composer.Task):
         return [target - self.scenario.joint_offset for target in self._queue]
 
     def landing_mm(self, physics: mjcf.Physics) -> FloatArray:
-        """Where the flange's centre stands over the target, in the target plane.
+        """Where the tip stands over the target, in the target plane.
 
         Returns:
             (2,) mm: along the base's x axis as the plane shows it, and across it (normal times
@@ -481,7 +486,7 @@ class ArmTask(composer.Task):
         normal = goal.normal
         along = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
         along /= np.linalg.norm(along)
-        offset = 1000.0 * (self.flange_position(physics) - goal.target)
+        offset = 1000.0 * (self.tip(physics).position - goal.target)
         return np.array([offset @ along, offset @ np.cross(normal, along)])
 
     def commandable(self, q: npt.ArrayLike) -> npt.NDArray[np.float32]:
@@ -512,8 +517,9 @@ class ArmTask(composer.Task):
             return self.cameras[camera].id
         view = mujoco.MjvCamera()
         view.type = mujoco.mjtCamera.mjCAMERA_FREE.value
-        view.lookat[:] = [0.0, 0.0, 0.48]
-        view.distance, view.azimuth, view.elevation = 2.15, 145.0, -22.0
+        # Far enough for a stretched arm, whichever way it points.
+        view.lookat[:] = [0.0, 0.0, 0.44]
+        view.distance, view.azimuth, view.elevation = 2.6, 145.0, -22.0
         return view
 
     def _is_occluded(

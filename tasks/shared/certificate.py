@@ -18,12 +18,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from hvs_suite.cell.embodiment import BARE_ARM, Embodiment
 from hvs_suite.cell.kinematics import away_from_stops, kinematics, travel_time
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
 from hvs_suite.errors import LockError
 from hvs_suite.files import replacing
 from hvs_suite.tasks.shared.detection import Disc, find_disc
 from hvs_suite.tasks.shared.goal import Goal
+from hvs_suite.tasks.shared.metric import Metric
 from hvs_suite.tasks.shared.start import steps_lower_bound
 
 if TYPE_CHECKING:
@@ -139,7 +141,7 @@ def check_geometry(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
     for index in scenarios:
         env.reset(scenario=index)
         goal = env.task.goal()
-        margins.append(joint_margin_deg(goal))
+        margins.append(joint_margin_deg(goal, spec.embodiment))
         bounds.append(steps_lower_bound(spec, env.scenario.start, goal))
     env.draws = True
     limit = spec.time_limit_steps
@@ -432,6 +434,22 @@ def solved_check(n_success: int, n_collision: int, n: int, mean_steps: float) ->
     )
 
 
+def limit_check(metric: Metric, values: Sequence[float]) -> Check:
+    """How near the expert comes to a limit whose breach ends an episode.
+
+    Args:
+        metric: What is limited.
+        values: The largest of each episode.
+    """
+    bound = math.inf if metric.bound is None else metric.bound
+    return Check(
+        f"safe: expert's {metric.title}, 99th percentile and largest",
+        f"{np.percentile(values, 99):.1f}, {max(values):.1f} {metric.unit}",
+        f"<= {bound:g} {metric.unit}",
+        max(values) <= bound,
+    )
+
+
 def _steps_look_and_go(env: "Environment") -> int:
     """Least steps to a posture from which a camera sees the target, and on to the goal."""
     spec, scenario, goal = env.spec, env.scenario, env.task.goal()
@@ -462,9 +480,9 @@ def target_in(env: "Environment", camera: str) -> FloatArray:
     return found
 
 
-def joint_margin_deg(goal: Goal) -> float:
+def joint_margin_deg(goal: Goal, embodiment: Embodiment = BARE_ARM) -> float:
     """Least margin to a joint stop in a goal's best posture (deg); -inf if it is out of reach."""
-    family = kinematics().goal_configurations(goal.position, goal.normal)
+    family = kinematics(embodiment).goal_configurations(goal.position, goal.normal)
     if not len(family):
         return -math.inf
     return float(np.rad2deg((JOINT_RANGE_RAD - np.abs(family)).min(axis=1).max()))

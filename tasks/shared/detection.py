@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from hvs_suite.cell.cameras import project
+
 FloatArray = npt.NDArray[np.float64]
 
 # Warm pixels are the target's red and the robot's orange alike. Pixel noise would cut holes into
@@ -46,6 +48,8 @@ DRAWN_AREA = float(np.sin(2.0 * np.pi / 20) / (2.0 * np.pi / 20))
 # Rows and columns around a patch that hold its edge, and the background beyond.
 _EDGE_PX = 2
 _BACKGROUND_PX = 2
+_CIRCLE = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+_RIM = np.stack([np.cos(_CIRCLE), np.sin(_CIRCLE), np.zeros(len(_CIRCLE))], axis=1)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -179,6 +183,51 @@ def find_level_disc(
             if is_whole_disc(disc, drawn_m2 * K[0, 0] ** 2 * eye[2] / depth**3):
                 return disc
     return None
+
+
+def intersect(uv: FloatArray, K: FloatArray, T: FloatArray, height_m: float) -> FloatArray | None:
+    """Where the ray of a pixel meets a level plane.
+
+    Args:
+        uv: Pixels, (n, 2).
+        K: Intrinsics, (3, 3) px.
+        T: Extrinsics, (4, 4), base to optical frame.
+        height_m: Height of the plane (m).
+
+    Returns:
+        Places (n, 2) in m, or None where a ray does not come down on the plane.
+    """
+    rays = np.concatenate([(uv - K[:2, 2]) / [K[0, 0], K[1, 1]], np.ones((len(uv), 1))], axis=1)
+    down = rays @ T[:3, :3]
+    eye = -T[:3, :3].T @ T[:3, 3]
+    if eye[2] <= height_m or (down[:, 2] > -0.02 * np.linalg.norm(down, axis=1)).any():
+        return None
+    reach = (height_m - eye[2]) / down[:, 2]
+    return np.asarray(eye[:2] + reach[:, None] * down[:, :2])
+
+
+def outline(
+    place: FloatArray, diameter_m: float, K: FloatArray, T: FloatArray, height_m: float
+) -> tuple[float, FloatArray] | None:
+    """Area (px^2) and centre of area (2,) px of a disc's picture; None where it is not in front.
+
+    The centre of the picture is not the picture of the centre: perspective shifts it by up to a
+    millimetre for a near, tilted disc.
+    """
+    rim = np.array([*place, height_m]) + 0.5 * diameter_m * _RIM
+    seen = project(rim, K, T)
+    if (seen[:, 2] < 0.01).any():
+        return None
+    u, v = seen[:, 0] - seen[0, 0], seen[:, 1] - seen[0, 1]
+    u_next, v_next = np.roll(u, -1), np.roll(v, -1)
+    cross = u * v_next - u_next * v
+    twice = float(cross.sum())
+    if abs(twice) < 1e-9:
+        return None
+    centre = np.array([((u + u_next) @ cross), ((v + v_next) @ cross)]) / (3.0 * twice)
+    # A polygon of 24 sides stands for the circle: put its missing area back.
+    circle = (2.0 * np.pi / len(_CIRCLE)) / np.sin(2.0 * np.pi / len(_CIRCLE))
+    return 0.5 * abs(twice) * circle, centre + seen[0, :2]
 
 
 def _measure(

@@ -32,7 +32,7 @@ from hvs_suite.cell.renderer import Renderer
 from hvs_suite.cell.solid import Solid
 from hvs_suite.errors import ScenarioError
 from hvs_suite.tasks.shared.arm_task import ArmTask
-from hvs_suite.tasks.shared.goal import Goal
+from hvs_suite.tasks.shared.goal import Goal, Tip
 from hvs_suite.tasks.shared.scenario import Scenario
 from hvs_suite.tasks.shared.spec import Spec
 
@@ -140,9 +140,10 @@ class Environment(composer.Environment):
         task = self._arm
         collided = False
         for _ in range(self._n_sub_steps):
+            touched = data.ncon
             mujoco.mj_step2(model, data)
             mujoco.mj_step1(model, data)
-            if data.ncon and task.is_forbidden(physics):
+            if (touched or data.ncon) and task.is_forbidden(physics):
                 collided = True
                 break
         self._control_steps += 1
@@ -261,6 +262,10 @@ class Environment(composer.Environment):
     def goal(self, ahead_s: float = 0.0) -> Goal:
         """Where the tool's tip has to be now, or some time from now (s)."""
         return self._arm.goal(ahead_s)
+
+    def tip(self) -> Tip:
+        """Where the tool's tip is now."""
+        return self._arm.tip(self._physics_proxy)
 
     @property
     def distance_m(self) -> float:

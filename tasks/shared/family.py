@@ -153,7 +153,10 @@ class Family[S: Spec, C: Scenario](abc.ABC):
         return False
 
     def is_forbidden(self, physics: "mjcf.Physics") -> bool:
-        """Whether a contact that exists now must never happen; asked after every physics step."""
+        """Whether what is touched now must never be.
+
+        Asked after every physics step before or after which anything touched anything.
+        """
         return bool(physics.data.ptr.ncon)
 
     def observe(self, physics: "mjcf.Physics") -> dict[str, FloatArray]:

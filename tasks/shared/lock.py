@@ -38,7 +38,8 @@ class LockEntry:
         version: Version of the task.
         parameters: Of its family and of the parameters that differ from the family's defaults, so
             that a new parameter does not change what it leaves alone.
-        robot: Of the robot's MJCF: chain, inertia, gains, collision bodies.
+        robot: Of the robot's MJCF as the task has it: chain, inertia, gains, collision bodies,
+            tool.
         scene: Of the whole cell's MJCF (markers, light, cameras, materials, meshes), and of one
             painted texture where textures vary.
         test_scenarios: Of the digests of all test scenarios in order.
@@ -125,7 +126,7 @@ def compute_entry(env: "Environment") -> LockEntry:
     return LockEntry(
         version=env.spec.version,
         parameters=_sha256(json.dumps(_parameters(env.spec), sort_keys=True)),
-        robot=_sha256(robot_mjcf()),
+        robot=_sha256(robot_mjcf(env.spec.embodiment)),
         scene=_sha256(_scene(env)),
         test_scenarios=_sha256(scenarios),
         rule=_sha256(json.dumps(list(_judged(env)))),

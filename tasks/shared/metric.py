@@ -15,6 +15,7 @@ class Metric:
         bound: Largest value of a success; None where the figure is only reported.
         over: ``step``: measured at the end of each control step. ``episode``: kept over the
             episode so far.
+        is_limit: Whether a breach of the bound ends the episode at once: an overload.
     """
 
     name: str
@@ -22,3 +23,4 @@ class Metric:
     title: str
     bound: float | None = None
     over: Literal["step", "episode"] = "step"
+    is_limit: bool = False

@@ -162,7 +162,13 @@ def _of_family(task: "ArmTask", name: str) -> VectorObservable:
     shape = (len(known.dimensions),)
 
     def read(physics: mjcf.Physics) -> FloatArray:
-        return np.clip(task.family.observe(physics)[name], known.low, known.high)
+        value = task.family.observe(physics)[name]
+        if known.noise:
+            random = task.source.generator(
+                f"noise-{name}", task.scenario.index, task.environment.control_steps
+            )
+            value = value + random.normal(size=shape) * known.noise
+        return np.clip(value, known.low, known.high)
 
     return VectorObservable(read, specs.BoundedArray(shape, np.float64, known.low, known.high))
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 import numpy.typing as npt
 
+from hvs_suite.cell.embodiment import BARE_ARM, Embodiment
 from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared.family import Family
 from hvs_suite.tasks.shared.goal import (
@@ -60,12 +61,44 @@ HARD: Mapping[str, Any] = MappingProxyType(
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PlacingSpec(Spec):
-    """Parameters of placing the flange over a marker.
+class RingSpec(Spec):
+    """Parameters of tasks whose target is one round thing on the ring that the arm reaches.
 
     Attributes:
         ring_m: Inner and outer radius of the ring of targets (m).
-        target_diameter_m: Diameter of the marker (m).
+        target_diameter_m: Diameter of the target (m).
+    """
+
+    ring_m: tuple[float, float] = scene((0.40, 0.78))
+    target_diameter_m: float = 0.050
+
+    def __post_init__(self) -> None:
+        """Refuse values that make no sense, with a sentence.
+
+        Raises:
+            OptionError: One of them does not.
+        """
+        super().__post_init__()
+        self._check("must be positive", lambda value: value > 0, "target_diameter_m")
+        if not 0.0 < self.ring_m[0] < self.ring_m[1]:
+            raise OptionError(f"ring_m is {self.ring_m}; use an inner and a larger outer radius")
+
+    @property
+    def reach_m(self) -> float:
+        """Outer radius of the ring (m)."""
+        return self.ring_m[1]
+
+    @property
+    def look_from_m(self) -> float:
+        """How far above the target the tip is where the eye in the hand sees it best (m)."""
+        raise NotImplementedError
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PlacingSpec(RingSpec):
+    """Parameters of placing the flange over a marker.
+
+    Attributes:
         marker: Picture on the target.
         standoff_m: Distance from surface to flange face at the goal (m).
         position_tolerance_mm: Bound on the norm of the position error, or None where each
@@ -77,8 +110,6 @@ class PlacingSpec(Spec):
 
     headline: ClassVar[tuple[str, ...]] = (POSITION, TILT)
 
-    ring_m: tuple[float, float] = scene((0.40, 0.78))
-    target_diameter_m: float = 0.050
     marker: Literal["disc", "ring", "fiducial"] = "disc"
     standoff_m: float = scene(0.050)
     position_tolerance_mm: float | None = 1.0
@@ -96,7 +127,6 @@ class PlacingSpec(Spec):
         self._check(
             "must be positive",
             lambda value: value > 0,
-            "target_diameter_m",
             "standoff_m",
             "tilt_tolerance_deg",
         )
@@ -111,8 +141,6 @@ class PlacingSpec(Spec):
             raise OptionError(
                 "give position_tolerance_mm, or both lateral_tolerance_mm and height_tolerance_mm"
             )
-        if not 0.0 < self.ring_m[0] < self.ring_m[1]:
-            raise OptionError(f"ring_m is {self.ring_m}; use an inner and a larger outer radius")
 
     @property
     def metrics(self) -> tuple[Metric, ...]:
@@ -123,6 +151,11 @@ class PlacingSpec(Spec):
             Metric(HEIGHT, "mm", "height error", self.height_tolerance_mm),
             Metric(TILT, "deg", "tilt error", self.tilt_tolerance_deg),
         )
+
+    @property
+    def look_from_m(self) -> float:
+        """At the goal."""
+        return self.standoff_m
 
     @property
     def landing_metric(self) -> Metric | None:
@@ -144,11 +177,6 @@ class PlacingSpec(Spec):
             target=f"{self.target_diameter_m * 1000:.0f} mm {self.marker}",
             tolerance=", ".join([*parts, f"{self.tilt_tolerance_deg:g} deg"]),
         )
-
-    @property
-    def reach_m(self) -> float:
-        """Outer radius of the ring (m)."""
-        return self.ring_m[1]
 
     def instruction(self, scenario: Scenario | None = None) -> str:
         """The task as one sentence, identical in environment and dataset."""
@@ -204,10 +232,7 @@ class Placing[S: PlacingSpec, C: Scenario](Family[S, C]):
 
     def draw_on_ring(self, random: np.random.Generator) -> tuple[float, float]:
         """Draw a point of the ring, uniform in area (m, base frame)."""
-        inner, outer = self.spec.ring_m
-        radius = math.sqrt(random.uniform(inner**2, outer**2))
-        azimuth = random.uniform(-math.pi, math.pi)
-        return radius * math.cos(azimuth), radius * math.sin(azimuth)
+        return point_on_ring(self.spec.ring_m, random)
 
     def goal_over(self, x: float, y: float) -> Goal:
         """The goal over a point of the level surface (m, base frame)."""
@@ -238,9 +263,19 @@ class Placing[S: PlacingSpec, C: Scenario](Family[S, C]):
         ]
 
 
-def is_reachable(goal: Goal) -> bool:
-    """Whether the flange can be at a goal within the joint ranges."""
+def point_on_ring(ring_m: tuple[float, float], random: np.random.Generator) -> tuple[float, float]:
+    """Draw a point of a ring, given by its radii, uniform in area (m, base frame)."""
+    inner, outer = ring_m
+    radius = math.sqrt(random.uniform(inner**2, outer**2))
+    azimuth = random.uniform(-math.pi, math.pi)
+    return radius * math.cos(azimuth), radius * math.sin(azimuth)
+
+
+def is_reachable(goal: Goal, embodiment: Embodiment = BARE_ARM) -> bool:
+    """Whether the tip can be at a goal within the joint ranges."""
     from hvs_suite.cell.kinematics import kinematics
 
-    found = kinematics().goal_configurations_at_tool_angle(goal.position, goal.normal, 0.0)
+    found = kinematics(embodiment).goal_configurations_at_tool_angle(
+        goal.position, goal.normal, 0.0
+    )
     return bool(len(found))

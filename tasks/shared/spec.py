@@ -14,6 +14,7 @@ from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
+from hvs_suite.cell.embodiment import BARE_ARM, Embodiment
 from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared import option_types
 from hvs_suite.tasks.shared.metric import Metric
@@ -145,11 +146,13 @@ class VectorObservation:
         dimensions: Names of its numbers.
         low: Least value of each of them.
         high: Largest value of each of them.
+        noise: Standard deviation of the noise on each of them; empty for none.
     """
 
     dimensions: tuple[str, ...]
     low: float
     high: float
+    noise: tuple[float, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -284,6 +287,18 @@ class Spec(Timing, Cameras, Disturbances):
         raise NotImplementedError
 
     @property
+    def embodiment(self) -> Embodiment:
+        """The robot: the arm alone, unless the family says otherwise."""
+        return BARE_ARM
+
+    def is_overload(self, errors: Mapping[str, float]) -> bool:
+        """Whether a metric is beyond a bound whose breach ends the episode at once."""
+        return any(
+            metric.is_limit and metric.bound is not None and errors[metric.name] > metric.bound
+            for metric in self.metrics
+        )
+
+    @property
     def privileged(self) -> dict[str, tuple[str, ...]]:
         """Vectors that only training may see, with the names of their dimensions.
 
@@ -309,7 +324,7 @@ class Spec(Timing, Cameras, Disturbances):
         end of each control step does.
         """
         bounded = [metric for metric in self.metrics if metric.bound is not None]
-        deciding = [metric for metric in bounded if metric.over == "episode"] or bounded
+        deciding = [m for m in bounded if m.over == "episode" and not m.is_limit] or bounded
         return {metric.name: metric.bound for metric in deciding if metric.bound is not None}
 
     @property

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from hvs_suite.cell.kinematics import kinematics, travel_time
+from hvs_suite.cell.kinematics import Kinematics, kinematics, travel_time
 from hvs_suite.cell.robot import JOINT_NAMES, JOINT_RANGE_RAD
 from hvs_suite.cell.solid import Solid, obstacle_distance
 from hvs_suite.errors import OptionError
@@ -59,19 +59,19 @@ def draw_start(
     if start == "random":
         return _random_start(spec, streams, goal, floor_normal, solids)
     if start == "fixed":
-        return _fixed_start(streams, floor_normal)
+        return _fixed_start(kinematics(spec.embodiment), streams, floor_normal)
     if start == "near_goal":
-        return _near_goal_start(streams, goal)
+        return _near_goal_start(kinematics(spec.embodiment), streams, goal)
     return np.array(start, dtype=np.float64)
 
 
-def _fixed_start(streams: Streams, floor_normal: FloatArray) -> FloatArray:
+def _fixed_start(model: Kinematics, streams: Streams, floor_normal: FloatArray) -> FloatArray:
     # Kept for all goals, so it cannot depend on one: clear of surface and self is all it is.
     random = streams.once("start-fixed")
     bound = RANDOM_START_RANGE * JOINT_RANGE_RAD
     for _ in range(MAX_REDRAWS):
         q = random.uniform(-bound, bound)
-        if kinematics().clearance(q, 0.0, floor_normal) >= START_CLEARANCE_M:
+        if model.clearance(q, 0.0, floor_normal) >= START_CLEARANCE_M:
             return q
     raise OptionError("no fixed start found that is clear of surface and self")
 
@@ -83,13 +83,13 @@ def _random_start(
     floor_normal: FloatArray,
     solids: tuple[Solid, ...],
 ) -> FloatArray:
-    model = kinematics()
+    model = kinematics(spec.embodiment)
     random = streams.generator("start")
     bound = RANDOM_START_RANGE * JOINT_RANGE_RAD
     steps = spec.time_limit_steps - SPARE_STEPS
     for _ in range(MAX_REDRAWS):
         q = random.uniform(-bound, bound)
-        if np.linalg.norm(model.flange_pose(q)[1] - goal.position) < START_GOAL_DISTANCE_M:
+        if np.linalg.norm(model.tip_pose(q)[1] - goal.position) < START_GOAL_DISTANCE_M:
             continue
         if model.clearance(q, 0.0, floor_normal) < START_CLEARANCE_M:
             continue
@@ -103,8 +103,8 @@ def _random_start(
     )
 
 
-def _near_goal_start(streams: Streams, goal: Goal) -> FloatArray:
-    reachable = kinematics().goal_configurations_at_tool_angle(goal.position, goal.normal, 0.0)
+def _near_goal_start(model: Kinematics, streams: Streams, goal: Goal) -> FloatArray:
+    reachable = model.goal_configurations_at_tool_angle(goal.position, goal.normal, 0.0)
     if not len(reachable):
         raise OptionError(
             f"scenario {streams.index}: the goal {goal.position.round(3).tolist()} is out of reach"
@@ -122,7 +122,7 @@ def _near_goal_start(streams: Streams, goal: Goal) -> FloatArray:
         scale = math.exp(random.uniform(low, high))
         q = posture + random.normal(size=7) * scale * [0.5, 0.5, 0.5, 0.5, 1, 1, 2]
         if (np.abs(q) < JOINT_RANGE_RAD).all() and (
-            kinematics().clearance(q, height, goal.normal) >= _NEAR_GOAL_CLEARANCE_M
+            model.clearance(q, height, goal.normal) >= _NEAR_GOAL_CLEARANCE_M
         ):
             return q
     raise OptionError(f"no start near the goal found for scenario {streams.index}")
@@ -137,12 +137,12 @@ def steps_lower_bound(spec: Spec, start: FloatArray, goal: Goal) -> int:
     Args:
         spec: Task whose period, hold and latency count.
         start: Joint angles, (7,) rad.
-        goal: Where the flange has to be.
+        goal: Where the tip has to be.
 
     Returns:
         Steps; a large number where the goal is out of reach.
     """
-    configurations = kinematics().goal_configurations_at_tool_angle(
+    configurations = kinematics(spec.embodiment).goal_configurations_at_tool_angle(
         goal.position, goal.normal, float(start[6])
     )
     if not len(configurations):

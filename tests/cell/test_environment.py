@@ -386,6 +386,24 @@ def test_a_closed_environment_may_be_closed_again() -> None:
     env.close()
 
 
+@pytest.mark.parametrize("azimuth", np.radians([-150.0, -90.0, -35.0, 0.0, 55.0, 90.0, 145.0]))
+def test_the_cell_view_shows_the_whole_hand_of_a_stretched_arm(named: Named, azimuth) -> None:
+    env = named("align-thesis")
+    env.reset(scenario=0)
+    model = env.physics.model
+    hand = np.flatnonzero(model.geom_bodyid == model.name2id("iiwa7/link_7", "body"))
+    for shoulder in (0.0, 0.6, 1.1, 1.5):
+        env.task.place(env.physics, np.array([azimuth, shoulder, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        seen = env.render(200, 200)
+        kept = model.geom_matid[hand].copy(), model.geom_rgba[hand].copy()
+        model.geom_matid[hand], model.geom_rgba[hand] = -1, [0.0, 1.0, 0.0, 1.0]
+        changed = (env.render(200, 200) != seen).any(axis=-1)
+        model.geom_matid[hand], model.geom_rgba[hand] = kept
+        assert changed.sum() > 3
+        assert not changed[[0, 1, -2, -1]].any()
+        assert not changed[:, [0, 1, -2, -1]].any()
+
+
 def test_pictures_for_people_show_the_same_scene_as_the_cameras(named: Named) -> None:
     env = named("align-thesis")
     env.reset(scenario=0)

@@ -71,7 +71,7 @@ def test_dataset_viz_writes_an_episode(tmp_path):
     assert recording.stat().st_size > 50_000
 
 
-def test_edit_dataset_informs_splits_and_merges(tmp_path):
+def test_what_edit_dataset_splits_merges_and_trims_stays_a_dataset_of_ours(tmp_path):
     edit = ("lerobot-edit-dataset", "--repo_id", "local/sample", "--root", SAMPLE)
     done = call(tmp_path, *edit, "--operation.type", "info")
     assert_done(done)
@@ -91,9 +91,16 @@ def test_edit_dataset_informs_splits_and_merges(tmp_path):
     before, after = columns(SAMPLE), columns(tmp_path / "merged")
     for name in ("action", "observation.state", "index", "episode_index", "privileged.scenario"):
         assert before[name] == after[name], name
-    # Our own file says where the frames come from; beside LeRobot's it makes the copy checkable.
-    shutil.copy(SAMPLE / "hvs.json", tmp_path / "merged")
-    assert [str(each) for each in check_dataset(tmp_path / "merged", pictures=False).damage] == []
+    trim = ("--operation.type", "delete_episodes", "--operation.episode_indices", "[0, 2]")
+    edit = ("lerobot-edit-dataset", "--repo_id", "local/merged", "--root", tmp_path / "merged")
+    trimmed = tmp_path / "trimmed"
+    assert_done(call(tmp_path, *edit, *trim, "--new_repo_id", "local/t", "--new_root", trimmed))
+    for edited in (first, tmp_path / "merged", trimmed):
+        assert run(["attach", str(edited), "--origin", str(SAMPLE)]) == 0
+        assert run(["check", str(edited)]) == 0
+    words = ["pretrain", "--data", str(trimmed), "--out", str(tmp_path / "p"), "--steps", "1"]
+    assert run(words) == 0
+    assert run(["share", str(trimmed), "--to-archive", str(tmp_path / "t.tar")]) == 0
 
 
 def test_act_trains_for_a_few_steps_and_is_scored(tmp_path):

@@ -85,7 +85,7 @@ def test_where_the_far_camera_may_be_off_the_hand_looks_before_it_comes_down(tas
 
 @pytest.mark.parametrize("task", ["align-hard", "align-limit"])
 def test_from_a_random_start_the_way_is_the_one_that_the_policy_takes_to_be_the_nearer(task):
-    from hvs_suite.policies.hvs.geometry import way_to_posture
+    from hvs_suite.policies.network.geometry import way_to_posture
 
     both = 0
     with hvs_suite.load(task, split="train", observations="state") as env:

@@ -16,7 +16,7 @@ from test_result_file import make_result, of_rows, row
 
 from hvs_suite.errors import OptionError, OutputError, ResultError
 from hvs_suite.eval import leaderboard, protocol
-from hvs_suite.eval.board import clips, matrix, plots, replay_check, submission, tables
+from hvs_suite.eval.board import clips, entry_sheet, matrix, plots, replay_check, submission, tables
 from hvs_suite.eval.board.page import page
 from hvs_suite.eval.board.tables import Entry
 from hvs_suite.eval.scoring import result_file, verification
@@ -239,6 +239,13 @@ def test_landings_stand_where_the_flange_stood() -> None:
     assert '<path class="lost" d="M100 200h0"/>' in plot
     assert 'class="miss"' not in plot
     assert '<circle class="goal" cx="100" cy="100" r="50.0"/>' in plot
+
+
+def test_landings_outside_the_picture_are_counted_in_a_sentence_of_its_own() -> None:
+    rows = [row(k, success=False, error=5.0, settled={"x_mm": 5.0}) for k in range(20)]
+    rows.append(row(20, success=False, error=90.0, settled={"x_mm": 90.0}))
+    sheet = entry_sheet.sheet(Entry("a", of_rows(rows), None), ())
+    assert "The circle is the tolerance, 5 mm. 1 of 21 landings lie outside the picture." in sheet
 
 
 @pytest.mark.parametrize(("error", "radius"), [(0.0, 0.001), (0.9, 1), (1.1, 2), (430.0, 500)])

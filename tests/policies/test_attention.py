@@ -5,7 +5,7 @@ import torch
 from PIL import Image
 
 from hvs_suite.cli.main import run
-from hvs_suite.policies.hvs.network import Eye
+from hvs_suite.policies.network.network import Eye
 
 
 def test_attention_is_a_distribution_whose_mean_is_the_keypoint():

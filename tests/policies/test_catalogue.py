@@ -52,6 +52,13 @@ def test_random_starts_again_with_each_episode():
     np.testing.assert_array_equal(first, [policy.select_action({}) for _ in range(3)])
 
 
+def test_a_run_of_lerobot_train_is_told_where_its_policy_lies(tmp_path):
+    policy = tmp_path / "act/checkpoints/last/pretrained_model"
+    policy.mkdir(parents=True)
+    with pytest.raises(PolicyError, match=f"name its policy, {policy}"):
+        policy_factory(str(tmp_path / "act"), "align-easy")
+
+
 @pytest.mark.parametrize("spec", ["expert", "servo", "zero", "random"])
 def test_factories_travel_to_workers(spec):
     factory = policy_factory(spec, "align-easy")

@@ -11,10 +11,10 @@ from safetensors.torch import load_file
 import hvs_suite
 from hvs_suite.datasets.expert import Expert
 from hvs_suite.errors import OptionError
-from hvs_suite.policies.hvs.dataset import read_manifest
 from hvs_suite.policies.imitation.dagger import play_round, read_round, round_shares
 from hvs_suite.policies.imitation.demonstrations import Demonstrations
 from hvs_suite.policies.imitation.pretrain import pretrain
+from hvs_suite.policies.network.dataset import read_manifest
 
 SIDE = 28
 OPTIONS = {"eih_resolution": SIDE, "eth_resolution": SIDE}

@@ -31,8 +31,8 @@ from hvs_suite.policies.finetune.stage import (
     ResidualStage,
 )
 from hvs_suite.policies.finetune.training import finetune
-from hvs_suite.policies.hvs.network import CONTROL_PERIOD_S, SET_POINT
 from hvs_suite.policies.imitation.pretrain import pretrain
+from hvs_suite.policies.network.network import CONTROL_PERIOD_S, SET_POINT
 from hvs_suite.policies.rl.evaluation import Evaluation, fallen
 from hvs_suite.policies.rl.journal import Journal
 from hvs_suite.rollout import run_episode

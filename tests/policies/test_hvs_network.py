@@ -9,9 +9,9 @@ import torch
 
 from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.cell.robot import JOINT_RANGE_RAD
-from hvs_suite.policies.hvs import geometry
-from hvs_suite.policies.hvs.compiled import CompiledFeatures, CompiledNetwork
-from hvs_suite.policies.hvs.network import (
+from hvs_suite.policies.network import geometry
+from hvs_suite.policies.network.compiled import CompiledFeatures, CompiledNetwork
+from hvs_suite.policies.network.network import (
     FEATURE_SIZE,
     HvsNetwork,
     Shape,

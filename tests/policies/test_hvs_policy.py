@@ -1,5 +1,8 @@
 """The LeRobot side of the `hvs` policy: checkpoints, processors, discovery."""
 
+import subprocess
+import sys
+
 import miniature
 import pytest
 import torch
@@ -25,11 +28,21 @@ def batch():
     return tensors
 
 
+def test_importing_the_package_registers_the_type():
+    ask = (
+        "import hvs_suite.policies.hvs\n"
+        "from lerobot.configs import PreTrainedConfig\n"
+        "print(PreTrainedConfig.get_choice_class('hvs').__name__)"
+    )
+    done = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, check=True)
+    assert done.stdout == "HvsConfig\n"
+
+
 def test_lerobot_finds_policy_and_processors_by_type(checkpoint):
     from lerobot.configs import PreTrainedConfig
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
-    import hvs_suite.policies.hvs.configuration_hvs  # noqa: F401 - registers the type
+    import hvs_suite.policies.hvs  # noqa: F401 - registers the type
 
     config = PreTrainedConfig.from_pretrained(checkpoint)
     assert config.type == "hvs"

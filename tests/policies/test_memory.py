@@ -9,9 +9,9 @@ import hvs_suite
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
 from hvs_suite.datasets.expert import Expert
 from hvs_suite.datasets.looking import LOOK_OUT_RAD
-from hvs_suite.policies.hvs.geometry import Calibration, calibrate, flange_motion
-from hvs_suite.policies.hvs.network import HEIGHT_SUMS, SET_POINT, HvsNetwork, Shape, Sighting
 from hvs_suite.policies.imitation.remembered import remembered
+from hvs_suite.policies.network.geometry import Calibration, calibrate, flange_motion
+from hvs_suite.policies.network.network import HEIGHT_SUMS, SET_POINT, HvsNetwork, Shape, Sighting
 
 CAMERAS = {"eih": (3, 28), "eth": (3, 28)}
 PLACE = torch.tensor([[0.4, 0.3, 0.0, 1.0]])

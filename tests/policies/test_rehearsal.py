@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from hvs_suite.policies.hvs.dataset import read_manifest
-from hvs_suite.policies.hvs.network import Sighting
-from hvs_suite.policies.hvs.rehearsal import drawn_sightings
 from hvs_suite.policies.imitation.demonstrations import Demonstrations
 from hvs_suite.policies.imitation.pretrain import pretrain
+from hvs_suite.policies.network.dataset import read_manifest
+from hvs_suite.policies.network.network import Sighting
+from hvs_suite.policies.network.rehearsal import drawn_sightings
 
 
 def truths(n, seed):

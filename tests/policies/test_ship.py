@@ -35,6 +35,16 @@ def test_a_shipped_folder_holds_what_others_need_and_plays(checkpoint, tmp_path)
         assert found in text
 
 
+def test_without_a_place_to_go_the_card_goes_into_the_checkpoint(checkpoint, tmp_path):
+    policy = tmp_path / "policy"
+    shutil.copytree(checkpoint, policy)
+    (policy / card.CARD).unlink(missing_ok=True)
+    before = files_below(policy)
+    assert run(["ship", str(policy)]) == 0
+    assert files_below(policy) == before | {card.CARD}
+    assert "library_name: lerobot" in (policy / card.CARD).read_text()
+
+
 def test_the_hub_gets_every_file_and_nobody_sees_the_token(checkpoint, tmp_path):
     local = tmp_path / "policy"
     shutil.copytree(checkpoint, local)
@@ -85,7 +95,7 @@ def test_notes_of_a_strange_run_are_refused_in_one_line(checkpoint, tmp_path, ca
 @pytest.mark.parametrize(
     ("words", "reason"),
     [
-        (["{policy}"], "--to-folder"),
+        (["{empty}"], "config.json"),
         (["{policy}", "--to-hub", "name"], "user/name"),
         (["{empty}", "--to-folder", "{out}"], "config.json"),
         (["{policy}", "--to-folder", "{out}", "--result", "{empty}/none.json"], "none.json"),

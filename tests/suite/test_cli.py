@@ -2,11 +2,12 @@
 
 import dataclasses
 import importlib
-import inspect
 import json
 import os
 import subprocess
 import sys
+from importlib.metadata import version
+from pathlib import Path
 
 import docstring_parser
 import pytest
@@ -14,6 +15,7 @@ import pytest
 import hvs_suite
 from hvs_suite.cli.main import COMMANDS, run
 
+SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "align-thesis"
 TASKS = tuple(hvs_suite.TASKS)
 
 
@@ -29,8 +31,11 @@ def refusal(capsys, *words):
 def described(command):
     """What a command's documentation says of itself and of each of its options."""
     module, _, name = COMMANDS[command].partition(":")
-    said = docstring_parser.parse(inspect.getdoc(getattr(importlib.import_module(module), name)))
-    return said.short_description, {each.arg_name: each.description for each in said.params}
+    kind = getattr(importlib.import_module(module), name)
+    # What commands have in common is a class that they derive from, and said there.
+    said = [docstring_parser.parse(each.__doc__) for each in kind.__mro__ if each is not object]
+    params = [param for each in reversed(said) for param in each.params]
+    return said[0].short_description, {each.arg_name: each.description for each in params}
 
 
 def test_help_gives_every_command_a_line_of_its_own(capsys):
@@ -66,6 +71,41 @@ def test_hvs_is_installed_as_a_command():
         check=True,
     )
     assert "align-thesis-v1" in done.stdout
+
+
+def test_python_dash_m_is_the_command_and_tells_the_version():
+    words = [sys.executable, "-m", "hvs_suite", "--version"]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert done.stdout == f"hvs {version('hvs-suite')}\n"
+
+
+def test_a_shell_completes_commands_and_options_once_it_was_installed(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    assert run(["completion", "bash", "--install"]) == 0
+    script = tmp_path / "bash-completion/completions/hvs"
+    # What bash does at a press of the tabulator: look up the function, and call it on the words.
+    press = """
+        source "$1"; shift
+        COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1))
+        $(complete -p hvs | sed "s/.*-F \\([^ ]*\\) .*/\\1/")
+        echo "${COMPREPLY[@]}"
+    """
+    for words, wanted in (
+        ("hvs eval", "evaluate"),
+        ("hvs evaluate --pol", "--policy"),
+        ("hvs study abl", "ablation"),
+    ):
+        done = subprocess.run(
+            ["bash", "-c", press, "bash", script, *words.split()], capture_output=True, text=True
+        )
+        assert done.stdout.split() == [wanted], done.stderr
+
+
+@pytest.mark.parametrize("shell", ["bash", "fish", "zsh"])
+def test_the_script_of_each_shell_names_every_command(shell, capsys):
+    assert run(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    assert [command for command in COMMANDS if command not in script] == []
 
 
 @pytest.mark.parametrize(
@@ -116,7 +156,10 @@ def test_tasks_prints_a_row_for_each_task(capsys):
     [
         (["dance"], "dance"),
         ([], "hvs"),
-        (["tasks", "--jsn"], "--jsn"),
+        (["tasks", "--jsn"], "did you mean --json?"),
+        (["evaluate", "--polic", "zero"], "did you mean --policy?"),
+        (["evaluate", "--policy", "zero", "--out", "r", "--episode", "3"], "mean --episodes?"),
+        (["verify", str(SAMPLE)], f"'hvs check {SAMPLE}'"),
         (["bench"], "--task"),
         (["bench", "--task", "align-thesis", "--seconds", "long"], "--seconds"),
     ],

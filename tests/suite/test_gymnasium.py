@@ -275,3 +275,89 @@ def test_async_workers_play_the_scenarios_they_are_asked_for(thesis, context):
         assert len(set.union(*seen)) == 8
     finally:
         workers.close()
+
+
+def test_the_spec_says_when_an_episode_ends():
+    from gymnasium.wrappers import TimeAwareObservation
+
+    for limit, options in ((20, {}), (7, {"time_limit_steps": 7}), (4, {"max_episode_steps": 4})):
+        env = gymnasium.make("hvs_suite/align-thesis-v1", observations="state", **options)
+        assert env.spec.max_episode_steps == limit
+        timed = TimeAwareObservation(env, flatten=False)
+        timed.reset(seed=0)
+        steps = [timed.step(HOLD) for _ in range(limit)]
+        assert [step[3] for step in steps] == [False] * (limit - 1) + [True]
+        assert steps[-1][0]["time"] == limit
+        timed.close()
+
+
+def test_a_limit_that_the_environment_would_not_reach_is_refused():
+    with pytest.raises(OptionError, match="use time_limit_steps=40"):
+        gymnasium.make("hvs_suite/align-thesis-v1", max_episode_steps=40)
+
+
+@pytest.mark.each_task
+def test_both_checkers_are_content_with_every_goal_environment(task):
+    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = gymnasium.make(f"hvs_suite/{task}-goal-v1").unwrapped
+        checker.check_env(env)
+        check_env(env)
+        env.close()
+
+
+def test_a_goal_environment_rewards_any_tip_at_any_goal():
+    from hvs_suite.datasets.expert import make_expert
+
+    env = gymnasium.make("hvs_suite/align-easy-goal-v1").unwrapped
+    first, _ = env.reset(options={"scenario": 0})
+    expert = make_expert(env.environment)
+    ended, rewards = False, []
+    while not ended:
+        observation, reward, terminated, truncated, info = env.step(expert.label())
+        rewards.append(reward)
+        ended = terminated or truncated
+    assert info["is_success"]
+    assert rewards == [0.0] * (len(rewards) - 1) + [1.0]
+    achieved = np.stack([first["achieved_goal"], observation["achieved_goal"]])
+    there, beside = achieved.copy(), achieved.copy()
+    beside[:, 0] += 0.006  # The task allows 5 mm.
+    desired = np.repeat(observation["desired_goal"][None], 2, axis=0)
+    nothing = [{}, {}]
+    assert env.compute_reward(achieved, desired, nothing).tolist() == [0.0, 1.0]
+    assert env.compute_reward(achieved, there, nothing).tolist() == [1.0, 1.0]
+    assert env.compute_reward(achieved, beside, nothing).tolist() == [0.0, 0.0]
+    assert env.compute_reward(achieved, there, [{"collision": True}, {}]).tolist() == [0.0, 1.0]
+    env.close()
+
+
+def test_hindsight_replay_of_stable_baselines_learns_from_what_was_reached():
+    sb3 = pytest.importorskip("stable_baselines3")
+    env = gymnasium.make("hvs_suite/align-easy-goal-v1")
+    model = sb3.SAC(
+        "MultiInputPolicy", env, replay_buffer_class=sb3.HerReplayBuffer, learning_starts=50, seed=0
+    )
+    model.learn(60)
+    assert not model.replay_buffer.rewards.any()
+    assert model.replay_buffer.sample(256).rewards.sum() > 0
+    env.close()
+
+
+def test_a_goal_environment_refuses_what_it_would_ignore():
+    for name in ("observations", "rewards"):
+        with pytest.raises(OptionError, match=name):
+            gymnasium.make("hvs_suite/align-easy-goal-v1", **{name: "state"})
+
+
+def test_record_video_films_an_episode(tmp_path):
+    from gymnasium.wrappers import RecordVideo
+
+    env = gymnasium.make("hvs_suite/align-easy-v1", render_mode="rgb_array", time_limit_steps=3)
+    env = RecordVideo(env, str(tmp_path), episode_trigger=lambda _: True)
+    env.reset(seed=0)
+    while not env.step(HOLD)[3]:
+        pass
+    env.close()
+    [film] = tmp_path.glob("*.mp4")
+    assert film.stat().st_size > 1000

@@ -23,8 +23,8 @@ from torch import Tensor, nn
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
 from hvs_suite.datasets.looking import LOOK_DOWN_M, LOOK_OUT_RAD
 from hvs_suite.datasets.planner import LEAD_S
-from hvs_suite.policies.hvs import geometry
-from hvs_suite.policies.hvs.geometry import Calibration
+from hvs_suite.policies.network import geometry
+from hvs_suite.policies.network.geometry import Calibration
 
 IMAGE_PREFIX = "observation.images."
 STATE = "observation.state"

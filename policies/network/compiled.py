@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor, nn
 
-from hvs_suite.policies.hvs import geometry
-from hvs_suite.policies.hvs.network import Decision, HvsNetwork, memory_size
+from hvs_suite.policies.network import geometry
+from hvs_suite.policies.network.network import Decision, HvsNetwork, memory_size
 
 # TorchScript looks at what it runs before it settles how.
 _WARM_UP_CALLS = 3

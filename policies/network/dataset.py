@@ -16,8 +16,8 @@ from hvs_suite.datasets import reader
 from hvs_suite.datasets.features import ACTION, ACTION_EXECUTED, dataset_features
 from hvs_suite.datasets.metadata import read_metadata
 from hvs_suite.errors import DatasetError, OptionError, UnknownTaskError
-from hvs_suite.policies.hvs.geometry import Calibration, calibrate
-from hvs_suite.policies.hvs.network import IMAGE_PREFIX, N_JOINTS, STATE
+from hvs_suite.policies.network.geometry import Calibration, calibrate
+from hvs_suite.policies.network.network import IMAGE_PREFIX, N_JOINTS, STATE
 from hvs_suite.registry import find
 from hvs_suite.tasks.shared.placing import PlacingSpec
 

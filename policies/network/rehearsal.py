@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from hvs_suite.policies.hvs.network import Sighting
+from hvs_suite.policies.network.network import Sighting
 
 NEIGHBOURS = 8
 """Errors are drawn from so many frames next in apparent size, on either side."""

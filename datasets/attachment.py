@@ -1,0 +1,71 @@
+"""An edited dataset gets its origin back, which LeRobot's tools leave behind, once it is proven."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from hvs_suite.datasets import reader
+from hvs_suite.datasets.check import check_dataset
+from hvs_suite.datasets.metadata import DatasetMetadata, read_metadata, write_metadata
+from hvs_suite.errors import DatasetError
+
+
+def attach(
+    root: Path,
+    origins: Sequence[Path],
+    *,
+    workers: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> DatasetMetadata:
+    """Writes ``hvs.json`` into a dataset that was made of others, if it is what they say.
+
+    All episodes are played again, without pictures: they are of the origins' task, split and
+    options, or this ends with an error and writes nothing.
+
+    Args:
+        root: The edited dataset.
+        origins: The datasets that it was made of, which differ in noise and command at most.
+        workers: Processes that share the episodes.
+        progress: As in `check_dataset`.
+
+    Returns:
+        What was written.
+
+    Raises:
+        DatasetError: The origins are of different tasks, splits or options, or an episode is not
+            what they say.
+        OutputError: The folder cannot be written.
+    """
+    reader.read_info(root)
+    metadata = _joined(root, [(origin, read_metadata(origin)) for origin in origins])
+    report = check_dataset(
+        root, metadata=metadata, workers=workers, pictures=False, progress=progress
+    )
+    if report.damage:
+        raise DatasetError(
+            f"{root} is not made of {', '.join(map(str, origins))} alone, or damaged: "
+            f"{report.damage[0]}"
+        )
+    write_metadata(root, metadata)
+    return metadata
+
+
+def _joined(root: Path, origins: Sequence[tuple[Path, DatasetMetadata]]) -> DatasetMetadata:
+    """The one origin of several recordings.
+
+    Raises:
+        DatasetError: They are no recordings of the same.
+    """
+    (first, joined), *others = origins
+    for place, other in others:
+        if not joined.same_recording(other.model_copy(update={"noise": joined.noise})):
+            raise DatasetError(
+                f"{first} and {place} were recorded on different tasks, splits or options, and "
+                f"{root} can be of one alone; take it apart with lerobot-edit-dataset"
+            )
+    # Where the noise differs, the largest allows what the others forbid.
+    return joined.model_copy(
+        update={
+            "noise": max(metadata.noise for _, metadata in origins),
+            "command": "; ".join(dict.fromkeys(metadata.command for _, metadata in origins)),
+        }
+    )

@@ -1,0 +1,105 @@
+"""Ways of a peg into a hole: over it by the planner, then straight down its axis, guarded.
+
+The arm is compliant and trails its set point by more than a control step, so ways are planned for
+the set point, which the controller follows exactly, and the arm is waited for where it matters:
+before the tip enters the mouth.
+"""
+
+import dataclasses
+
+import numpy as np
+import numpy.typing as npt
+
+from hvs_suite.cell.embodiment import Embodiment
+from hvs_suite.cell.kinematics import away_from_stops, kinematics
+from hvs_suite.cell.robot import JOINT_ACCELERATION_RAD_S2
+from hvs_suite.datasets.planner import Planner
+from hvs_suite.tasks.shared.goal import HEIGHT, LATERAL, TILT, Goal, Tip, goal_errors
+
+FloatArray = npt.NDArray[np.float64]
+
+ABOVE_MM = 50.0
+"""How far above the mouth the planner brings the tip (mm)."""
+NEAR_MM = 0.5
+"""A set point so near to the axis (mm) goes down along it."""
+UPRIGHT_DEG = 0.2
+SETTLED_MM = 0.1
+SETTLED_DEG = 0.25
+"""How well the arm itself stands over the hole before it enters."""
+GATE_MM = 3.0
+"""Where it is waited for (mm above the mouth)."""
+SLOW_MM = 1.5
+FAST_MM = 10.0
+"""Least and largest step down (mm)."""
+_BRAKING = 0.4
+_CAUGHT_MM = 30.0
+_PUSHES = 6
+_CLEAR_MM = 8.0
+"""Nearer to the axis than the first and lower than the second, the only way is up."""
+
+
+class GuardedInsertion:
+    """Decides where the set point goes; every answer stands on what is given with it alone.
+
+    Args:
+        period_s: Control period (s).
+        embodiment: The robot.
+    """
+
+    def __init__(self, period_s: float, embodiment: Embodiment) -> None:
+        self._kinematics = kinematics(embodiment)
+        self._planner = Planner(period_s, embodiment=embodiment)
+
+    def next_set_point(
+        self, joints: FloatArray, velocity: FloatArray, set_point: FloatArray, goal: Goal
+    ) -> FloatArray:
+        """Where the set point shall be at the end of the control step.
+
+        Args:
+            joints: Now, (7,) rad.
+            velocity: Of the joints, (7,) rad/s.
+            set_point: Now, (7,) rad.
+            goal: In the hole: its target is the middle of the mouth, its standoff negative.
+
+        Returns:
+            (7,) rad.
+        """
+        sent = self.errors(set_point, goal)
+        if sent[LATERAL] > NEAR_MM or sent[TILT] > UPRIGHT_DEG or sent[HEIGHT] > ABOVE_MM + 5.0:
+            if sent[LATERAL] < _CAUGHT_MM and sent[HEIGHT] < _CLEAR_MM:
+                return self.straight(set_point, self._raised(set_point, goal), goal)
+            above = dataclasses.replace(goal, standoff_m=0.001 * ABOVE_MM)
+            return self._planner.next_set_point(joints, velocity, above)
+        arm = self.errors(joints, goal)
+        height = sent[HEIGHT]
+        step = min(max(_BRAKING * (height - GATE_MM), SLOW_MM), FAST_MM)
+        waits = arm[LATERAL] > SETTLED_MM or arm[TILT] > SETTLED_DEG
+        if waits and arm[HEIGHT] > 0.0:
+            step = min(step, max(height - GATE_MM, 0.0))
+        depth_m = max(0.001 * (height - step), goal.standoff_m)
+        return self.straight(set_point, goal.target + depth_m * goal.normal, goal)
+
+    def errors(self, q: FloatArray, goal: Goal) -> dict[str, float]:
+        """Lateral error (mm), height above the mouth (mm) and tilt (deg) of the tip at q (7,)."""
+        R, p = self._kinematics.tip_pose(q)
+        return goal_errors(Tip(p, R[:, 2]), dataclasses.replace(goal, standoff_m=0.0))
+
+    def straight(self, set_point: FloatArray, tip: FloatArray, goal: Goal) -> FloatArray:
+        """The nearest set point (7,) with the tip (3,) at a place, along the goal's axis.
+
+        Where that is beyond a joint's stop, one that is pushed away from there.
+        """
+        start = set_point
+        for _ in range(_PUSHES):
+            near = self._kinematics.nearest_configuration(
+                start, tip, goal.normal, JOINT_ACCELERATION_RAD_S2
+            )
+            if near is not None:
+                return near
+            start = away_from_stops(start)
+        return set_point
+
+    def _raised(self, set_point: FloatArray, goal: Goal) -> FloatArray:
+        """A step straight up from where the set point's tip is (3,) m."""
+        _, p = self._kinematics.tip_pose(set_point)
+        return np.asarray(p + 0.001 * FAST_MM * goal.normal)

@@ -1,0 +1,433 @@
+"""``insert``: bring a peg on the flange into a bushing, without pressing too hard.
+
+A peg of 10 mm, held by a compliant arm, has to go 12 mm deep into a hole that is wider by a few
+tenths of a millimetre. The tip may touch the bushing and nothing else; what it presses with, after
+a low-pass of 50 Hz, must not go beyond a limit in any physics step: that ends the episode like a
+collision, and is called an overload.
+
+In ``insert-feel`` the hole is not quite where the paint says. No picture shows that, so the last
+millimetre has to be felt: by the wrench at the flange, and by where the tip stops. **The expert of
+that variant knows the hole**, which no learner can see: it goes straight in. Whoever imitates it
+learns where holes are on average, which is not enough; the way to search has to be found out.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from hvs_suite.cell.embodiment import Embodiment, Tool
+from hvs_suite.errors import OptionError
+from hvs_suite.tasks.shared.family import Family, Progress, register
+from hvs_suite.tasks.shared.goal import HEIGHT, LATERAL, TILT, Goal, Keypoint, Tip, goal_errors
+from hvs_suite.tasks.shared.metric import Metric
+from hvs_suite.tasks.shared.placing import HARD, UP, RingSpec, is_reachable, point_on_ring
+from hvs_suite.tasks.shared.scenario import Scenario, Streams, draw_look
+from hvs_suite.tasks.shared.spec import Description, VectorObservation, scene
+
+if TYPE_CHECKING:
+    from dm_control import mjcf
+
+    from hvs_suite.cell.arena import Cell
+    from hvs_suite.tasks.shared.certificate import Check
+    from hvs_suite.tasks.shared.environment import Environment
+
+FloatArray = npt.NDArray[np.float64]
+
+DEPTH = "depth_error_mm"
+PEAK_FORCE = "peak_force_n"
+WRENCH = "wrench"
+LIFT_M = 0.050
+"""How far above the mouth the tip comes from (m): the peg does not hide the bushing yet."""
+BOTTOM_M = 0.003
+"""Material below the hole; as the cell's, spelled out because that loads MuJoCo."""
+MIN_CLEARANCE_MM = 0.05
+"""What the physics was shown to hold."""
+FORCE_LOW_PASS_HZ = 50.0
+_IN_HOLE_MM = 0.1
+"""A tip is in the hole where it is off by the clearance and so much for tilt and give."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class InsertSpec(RingSpec):
+    """Every parameter of ``insert``.
+
+    Attributes:
+        peg_diameter_m: Diameter of the peg (m).
+        peg_length_m: Its length (m).
+        clearance_mm: By how much the hole's radius is larger (mm).
+        chamfer_mm: Width and depth of the chamfer at the hole's mouth (mm).
+        hole_depth_m: Depth of the hole (m).
+        goal_depth_m: How deep the tip shall be (m).
+        depth_tolerance_mm: By how much it may miss that (mm).
+        tilt_tolerance_deg: Bound on the angle between peg and hole.
+        force_limit_n: Largest contact force (N).
+        hole_noise_mm: Standard deviation of where the hole is off its paint (mm a direction), cut
+            at two sigma.
+        force_noise_n: Standard deviation of the noise on measured forces (N).
+        torque_noise_nm: Standard deviation of the noise on measured torques (Nm).
+        stiffness: Joint stiffness, as a share of the stiff position controller's.
+        physics_hz: Physics steps a second.
+    """
+
+    family: ClassVar[str] = "insert"
+    headline: ClassVar[tuple[str, ...]] = (DEPTH, PEAK_FORCE)
+    further_privileged: ClassVar[Mapping[str, tuple[str, ...]]] = {"hole_offset": ("x", "y")}
+    plays_on: ClassVar[bool] = False
+
+    target_diameter_m: float = 0.040
+    peg_diameter_m: float = 0.010
+    peg_length_m: float = scene(0.050)
+    clearance_mm: float = 0.5
+    chamfer_mm: float = 1.0
+    hole_depth_m: float = 0.015
+    goal_depth_m: float = 0.013
+    depth_tolerance_mm: float = 1.0
+    tilt_tolerance_deg: float = 1.0
+    force_limit_n: float = 80.0
+    hole_noise_mm: float = scene(0.0)
+    force_noise_n: float = 0.3
+    torque_noise_nm: float = 0.01
+    stiffness: float = 0.05
+    physics_hz: int = 480
+
+    def __post_init__(self) -> None:
+        """Refuse values that make no sense, with a sentence.
+
+        Raises:
+            OptionError: One of them does not.
+        """
+        super().__post_init__()
+        self._check(
+            "must be positive",
+            lambda value: value > 0,
+            "peg_diameter_m",
+            "chamfer_mm",
+            "depth_tolerance_mm",
+            "tilt_tolerance_deg",
+            "force_limit_n",
+        )
+        self._check(
+            "cannot be negative",
+            lambda value: value >= 0,
+            "hole_noise_mm",
+            "force_noise_n",
+            "torque_noise_nm",
+        )
+        self._check("must lie between 0.01 and 1", lambda value: 0.01 <= value <= 1.0, "stiffness")
+        self._check("must be at least 240", lambda value: value >= 240, "physics_hz")
+        self._check_shape()
+
+    def _check_shape(self) -> None:
+        """Refuse pegs and holes that cannot be.
+
+        Raises:
+            OptionError: They cannot.
+        """
+        widest = 500.0 * (self.target_diameter_m - self.peg_diameter_m) - self.chamfer_mm
+        if not MIN_CLEARANCE_MM <= self.clearance_mm < widest:
+            raise OptionError(
+                f"clearance_mm is {self.clearance_mm}; use {MIN_CLEARANCE_MM} (tighter the physics "
+                f"does not hold) to {widest:.1f} mm, which a bushing of "
+                f"{1000 * self.target_diameter_m:.0f} mm leaves"
+            )
+        if not self.hole_depth_m > 0.001 * self.chamfer_mm:
+            raise OptionError(f"hole_depth_m is {self.hole_depth_m}; it is deeper than its chamfer")
+        if not 0.0 < self.goal_depth_m < min(self.hole_depth_m, self.peg_length_m):
+            raise OptionError(
+                f"goal_depth_m is {self.goal_depth_m}; it must be positive, and less than the "
+                "depth of the hole and the length of the peg"
+            )
+
+    @property
+    def embodiment(self) -> Embodiment:
+        """The arm with the peg, compliant, and physics fine enough for contacts."""
+        return Embodiment(
+            tool=Tool(self.peg_diameter_m, self.peg_length_m),
+            stiffness=self.stiffness,
+            timestep_s=1.0 / self.physics_hz,
+            impratio=10.0,
+            noslip_iterations=0,
+        )
+
+    @property
+    def top_m(self) -> float:
+        """Height of the hole's mouth above the surface (m)."""
+        return BOTTOM_M + self.hole_depth_m
+
+    @property
+    def look_from_m(self) -> float:
+        """So high that the peg does not hide the bushing."""
+        return LIFT_M
+
+    @property
+    def metrics(self) -> tuple[Metric, ...]:
+        """Missing depth, lateral and tilt error at each step's end; the largest force so far."""
+        lateral_mm = self.clearance_mm + _IN_HOLE_MM
+        return (
+            Metric(DEPTH, "mm", "missing depth", self.depth_tolerance_mm),
+            Metric(LATERAL, "mm", "lateral error", lateral_mm),
+            Metric(TILT, "deg", "tilt error", self.tilt_tolerance_deg),
+            Metric(PEAK_FORCE, "N", "peak force", self.force_limit_n, "episode", is_limit=True),
+        )
+
+    @property
+    def further_observations(self) -> dict[str, VectorObservation]:
+        """Force (N) and torque (Nm) on the tool at the flange, flange axes."""
+        noise = 3 * (self.force_noise_n,) + 3 * (self.torque_noise_nm,)
+        names = ("fx", "fy", "fz", "tx", "ty", "tz")
+        return {WRENCH: VectorObservation(names, -200.0, 200.0, noise)}
+
+    @property
+    def hole_share(self) -> float:
+        """Share of the bushing's face that its mouth takes."""
+        mouth_m = self.peg_diameter_m + 0.002 * (self.clearance_mm + self.chamfer_mm)
+        return (mouth_m / self.target_diameter_m) ** 2
+
+    @property
+    def needed_depth_mm(self) -> float:
+        """How deep the tip has to be at least (mm)."""
+        return 1000.0 * self.goal_depth_m - self.depth_tolerance_mm
+
+    def instruction(self, scenario: Scenario | None = None) -> str:
+        """The task as one sentence."""
+        return (
+            f"Insert the peg {self.needed_depth_mm:.0f} mm deep into the bushing, without pressing "
+            f"harder than {self.force_limit_n:.0f} N."
+        )
+
+    def describe(self) -> Description:
+        """The task in words."""
+        words = super().describe()
+        others = [] if words.disturbances == "-" else [words.disturbances]
+        if self.hole_noise_mm:
+            others.append(f"hole off its paint by {self.hole_noise_mm:g} mm a direction")
+        return dataclasses.replace(
+            words,
+            target=f"bushing for a {1000 * self.peg_diameter_m:.0f} mm peg, "
+            f"{self.clearance_mm:g} mm wider a side, {self.chamfer_mm:g} mm chamfer",
+            tolerance=f"{self.needed_depth_mm:g} mm deep, {self.tilt_tolerance_deg:g} deg, "
+            f"at most {self.force_limit_n:g} N",
+            disturbances=", ".join(others) or "-",
+        )
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class InsertScenario(Scenario):
+    """One scene.
+
+    Attributes:
+        target: Where the paint says the hole is, on the surface below it, (3,) m, base frame.
+        hole_offset: By how much the hole itself is elsewhere, (2,) m; nobody sees it.
+    """
+
+    target: FloatArray
+    hole_offset: FloatArray
+
+
+class Insert(Family[InsertSpec, InsertScenario]):
+    """One bushing.
+
+    Raises:
+        OptionError: The arm cannot lift the tool over the bushing.
+    """
+
+    hard: ClassVar[Mapping[str, str]] = {
+        "insert-wide": (
+            "The arm is compliant and trails its set point, the peg hides the hole in the last "
+            "millimetres, and the tip may touch nothing but the bushing."
+        ),
+        "insert-jig": (
+            "Clearance and chamfer catch the tip within 0.7 mm, while encoders that are a little "
+            "off, light, colours and noise disturb what is seen; and the arm may start anywhere."
+        ),
+        "insert-feel": (
+            "The hole is off its paint by half a millimetre a direction, which no picture shows: "
+            "it has to be felt by the wrench and by where the tip stops, gently and in time. The "
+            "demonstrations do not show how, because the expert knows the hole."
+        ),
+    }
+    certificate_passes: ClassVar[int] = 4
+
+    def build(self, cell: "Cell") -> None:
+        """Stand the bushing there, with its hole, and feel what the peg presses with."""
+        from hvs_suite.cell.bushing import Bushing, Hole
+
+        spec = self.spec
+        self._check_reach()
+        shape: dict[str, Any] = {
+            "diameter_m": spec.target_diameter_m,
+            "hole_diameter_m": spec.peg_diameter_m + 0.002 * spec.clearance_mm,
+            "hole_depth_m": spec.hole_depth_m,
+            "chamfer_m": 0.001 * spec.chamfer_mm,
+        }
+        self._bushing, self._hole = Bushing(**shape), Hole(**shape)
+        cell.add_marker(self._bushing)
+        cell.add_prop(self._hole)
+        self._robot = cell.robot.mjcf_model
+        self._contact = self._hole.add_force_sensor(cell, self._robot)
+
+    def _check_reach(self) -> None:
+        embodiment = self.spec.embodiment
+        for radius in self.spec.ring_m:
+            mouth = np.array([radius, 0.0, self.spec.top_m])
+            if not all(
+                is_reachable(Goal(mouth, UP, height), embodiment)
+                for height in (LIFT_M, -self.spec.goal_depth_m)
+            ):
+                raise OptionError(
+                    f"peg_length_m is {self.spec.peg_length_m} and ring_m {self.spec.ring_m}: the "
+                    f"arm cannot lift the peg over a bushing at a radius of {radius} m; use a "
+                    "shorter peg, or radii nearer to 0.6 m"
+                )
+
+    def after_compile(self, physics: "mjcf.Physics") -> None:
+        """Look up what may touch, and the sensors."""
+        from hvs_suite.cell.tool import PEG_GEOMS, Wrench
+
+        model = physics.model
+        self._sensor = int(model.sensor_adr[physics.bind(self._contact).element_id])
+        self._wrench = Wrench(physics, self._robot)
+        pegs = [self._robot.find("geom", name) for name in PEG_GEOMS]
+        self._is_peg = np.zeros(model.ngeom, bool)
+        self._is_peg[physics.bind(pegs).element_id] = True
+        self._is_hole = np.zeros(model.ngeom, bool)
+        self._is_hole[physics.bind(self._hole.geoms).element_id] = True
+        self.marker_geom = int(physics.bind(self._bushing.geom).element_id)
+        bodies = model.geom_bodyid[[self.marker_geom, int(np.argmax(self._is_hole))]]
+        self._mocaps = model.body_mocapid[bodies]
+
+    def draw(self, streams: Streams) -> InsertScenario:
+        """Draw where the bushing stands, how far the hole is off, start and look."""
+        from hvs_suite.tasks.shared.start import draw_start
+
+        spec = self.spec
+        place = np.array([*point_on_ring(spec.ring_m, streams.generator("target")), 0.0])
+        offset = 0.001 * spec.hole_noise_mm * streams.cut_normal("hole", 2)
+        goal = Goal(place + np.append(offset, spec.top_m), UP, -spec.goal_depth_m)
+        own = self.named.start if self.named is not None else "zero"
+        above = dataclasses.replace(goal, standoff_m=LIFT_M)
+        start = draw_start(spec, own, streams, above, UP)
+        return InsertScenario(
+            target=place, hole_offset=offset, start=start, **draw_look(spec, streams)
+        )
+
+    def begin(self, physics: "mjcf.Physics", scenario: InsertScenario) -> None:
+        """Put the bushing where it stands, and its hole where that is."""
+        import mujoco
+
+        super().begin(physics, scenario)
+        data = physics.data.ptr
+        painted = scenario.target
+        hole = painted + np.append(scenario.hole_offset, 0.0)
+        data.mocap_pos[self._mocaps] = [painted, hole]
+        # The picture that follows shows where bodies were computed to be.
+        mujoco.mj_kinematics(physics.model.ptr, data)
+        self._goal = Goal(hole + self.spec.top_m * UP, UP, -self.spec.goal_depth_m)
+        self._force = self._peak_n = self._felt_at_s = 0.0
+
+    def goal(self, ahead_s: float = 0.0) -> Goal:
+        """In the hole itself, at any time."""
+        return self._goal
+
+    def measure(self, tip: Tip) -> dict[str, float]:
+        """How much depth is missing, and how far the tip is off the hole's axis."""
+        errors = goal_errors(tip, self._goal)
+        return {
+            DEPTH: max(errors[HEIGHT], 0.0),
+            LATERAL: errors[LATERAL],
+            TILT: errors[TILT],
+        }
+
+    def tally(
+        self, physics: "mjcf.Physics", errors: Mapping[str, float], progress: Progress
+    ) -> dict[str, float]:
+        """The largest force so far."""
+        return {PEAK_FORCE: self._peak_n}
+
+    def at_reset(self) -> dict[str, float]:
+        """No force yet."""
+        return {PEAK_FORCE: 0.0}
+
+    def is_forbidden(self, physics: "mjcf.Physics") -> bool:
+        """Whether something else than peg and bushing touches, or these too hard."""
+        data = physics.data.ptr
+        self._feel(data.sensordata[self._sensor : self._sensor + 3], data.time)
+        first, second = data.contact.geom.T
+        allowed = (self._is_peg[first] & self._is_hole[second]) | (
+            self._is_hole[first] & self._is_peg[second]
+        )
+        return self._peak_n > self.spec.force_limit_n or not allowed.all()
+
+    def _feel(self, force: FloatArray, time_s: float) -> None:
+        """Take in the contact force (3,) N of the last physics step, through the low-pass.
+
+        Steps without contact are not told of; the low-pass forgets in between.
+        """
+        rate = 2.0 * math.pi * FORCE_LOW_PASS_HZ
+        step_s = 1.0 / self.spec.physics_hz
+        idle_s = max(time_s - self._felt_at_s - step_s, 0.0)
+        keep = math.exp(-rate * step_s)
+        pressed = (1.0 - keep) * float(np.linalg.norm(force))
+        self._force = keep * math.exp(-rate * idle_s) * self._force + pressed
+        self._felt_at_s = time_s
+        self._peak_n = max(self._peak_n, self._force)
+
+    def keypoints(self) -> dict[str, Keypoint]:
+        """The middle of the painted face."""
+        centre = self.scenario.target + self.spec.top_m * UP
+        return {"target": Keypoint(centre, UP, self.spec.target_diameter_m)}
+
+    def observe(self, physics: "mjcf.Physics") -> dict[str, FloatArray]:
+        """What the tool feels."""
+        return {WRENCH: self._wrench.read(physics)}
+
+    def privileged(self) -> dict[str, FloatArray]:
+        """How far the hole is off its paint (m)."""
+        return {"hole_offset": self.scenario.hole_offset.copy()}
+
+    @classmethod
+    def certify(cls, env: "Environment", scenarios: Iterable[int]) -> list["Check"]:
+        """Reachable, in time, observable, accurate; what feeling has to do where sight ends."""
+        from hvs_suite.tasks.shared import certificate
+        from hvs_suite.tasks.shared import certificate_insert as insertion
+
+        return [
+            *certificate.check_geometry(env, scenarios),
+            # So small a thing is often half hidden behind the arm, and its middle misjudged.
+            *certificate.check_visibility(env, scenarios, needed_share=95.0),
+            *insertion.check_sight(env, scenarios),
+            *insertion.check_feeling(env, scenarios),
+        ]
+
+
+# At 112 px the eye to hand would show no more than two pixels of a bushing.
+_WIDE = InsertSpec(name="insert-wide", time_limit_steps=80, eth_resolution=224)
+
+register(
+    Insert,
+    _WIDE,
+    dataclasses.replace(
+        _WIDE,
+        name="insert-jig",
+        start="random",
+        time_limit_steps=100,
+        clearance_mm=0.2,
+        chamfer_mm=0.5,
+        force_limit_n=60.0,
+        joint_offset_deg=0.02,
+        **HARD,
+    ),
+    dataclasses.replace(
+        _WIDE,
+        name="insert-feel",
+        time_limit_steps=65,
+        clearance_mm=0.1,
+        chamfer_mm=0.2,
+        force_limit_n=40.0,
+        hole_noise_mm=0.5,
+    ),
+)
