@@ -80,8 +80,8 @@ def check_slope(env: "Environment", scenarios: Iterable[int], ring: Ring) -> lis
         assert bound is not None
         checks.append(
             Check(
-                f"accurate: {metric.title.removesuffix(' error')} of a tip sent by the marks in "
-                f"all looks, {PERCENTILE}th percentile",
+                f"accurate: {metric.title.removesuffix(' error')} from the marks in all looks, "
+                f"{PERCENTILE}th percentile",
                 f"{value:.3f} {metric.unit}",
                 f"<= {bound:g} {metric.unit}",
                 value <= bound,
@@ -89,7 +89,7 @@ def check_slope(env: "Environment", scenarios: Iterable[int], ring: Ring) -> lis
         )
     checks.append(
         Check(
-            f"hard: the same tilt by one look from the goal, {PERCENTILE}th percentile",
+            f"hard: tilt from the marks in one look from the goal, {PERCENTILE}th percentile",
             f"{np.percentile(alone, PERCENTILE):.3f} deg",
             "",
             True,
