@@ -32,7 +32,7 @@ lint: .venv/.up-to-date  ## ruff and mypy
 	@$(PY) -m mypy
 
 lock:  ## resolve requirements.lock anew
-	uv pip compile setup.cfg --extra learn --extra dev --override scripts/lock.overrides \
+	uv pip compile setup.cfg --extra learn --extra ray --extra dev --override scripts/lock.overrides \
 	  --universal --python-version 3.12 --upgrade --quiet \
 	  --no-annotate --no-header --no-emit-index-url --no-emit-find-links -o requirements.lock
 

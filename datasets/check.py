@@ -28,6 +28,7 @@ from hvs_suite.datasets.moments import Moments, compare, compare_all, merge, sam
 from hvs_suite.datasets.reader import DamagedFileError, Place
 from hvs_suite.datasets.resimulation import resimulate
 from hvs_suite.errors import DatasetError, HvsError, ScenarioError
+from hvs_suite.executor import Workers
 from hvs_suite.names import shown
 from hvs_suite.registry import find
 from hvs_suite.rollout import play
@@ -92,7 +93,7 @@ def check_dataset(
     root: Path,
     *,
     metadata: DatasetMetadata | None = None,
-    workers: int = 1,
+    workers: Workers = 1,
     pictures: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Report:
@@ -101,7 +102,7 @@ def check_dataset(
     Args:
         root: The dataset.
         metadata: Origin to hold it against; the dataset's own by default.
-        workers: Processes that share the episodes.
+        workers: Processes that share the episodes, or others elsewhere that see the same folder.
         pictures: Also draw every frame again and compare; decoding is checked in any case.
         progress: Called after each episode with the number checked and of all.
 
@@ -135,7 +136,7 @@ def check_dataset(
     damage += in_files
     sound = [place for place in places if place.file not in unreadable]
     job = CheckEpisode(
-        root,
+        root.resolve(),
         metadata,
         {place.episode: place for place in sound},
         features,

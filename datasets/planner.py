@@ -313,9 +313,11 @@ class Planner:
     def _look_around(self, q: FloatArray, goal: Goal) -> None:
         """Take in how far the arm is from what it must not touch."""
         # Distances are to a level plane. Where the surface is not level at the target, that is the
-        # target's height, which is right near the goal and a guess far from it.
-        height = float(goal.target[2])
-        self._floor_m = height if goal.normal[2] > _LEVEL else height - CLEARANCE_M
+        # target's height, which is right near the goal and a guess far from it; unless all that
+        # stands on the table is known.
+        height = 0.0 if self._solids else float(goal.target[2])
+        is_level = goal.normal[2] > _LEVEL or bool(self._solids)
+        self._floor_m = height if is_level else height - CLEARANCE_M
         self._clearance_m = self._clearance(q)
 
     def _clearance(self, q: FloatArray) -> float:

@@ -21,6 +21,7 @@ from hvs_suite.datasets.metadata import (
     write_metadata,
 )
 from hvs_suite.errors import DatasetError, HvsError, OptionError, OutputError, ScenarioError
+from hvs_suite.executor import Workers, check_workers
 from hvs_suite.names import check_name
 from hvs_suite.registry import find, options_of
 from hvs_suite.rollout import play
@@ -62,7 +63,7 @@ def record(
     out: str | Path,
     options: Mapping[str, Any] | None = None,
     *,
-    workers: int = 1,
+    workers: Workers = 1,
     noise: float = 0.0,
     resume: bool = False,
     progress: Callable[[Progress], None] | None = None,
@@ -77,7 +78,7 @@ def record(
         split: Stream of scenarios.
         out: Root of the dataset; missing or empty, unless ``resume``.
         options: Options of the task, start distributions among them.
-        workers: Processes that play; 1 plays in this one.
+        workers: Processes that play, 1 being this one; or others elsewhere.
         noise: Standard deviation of the temporally correlated perturbation of the executed joint
             targets, far from the goal (rad). The expert's own action stays the label.
         resume: Go on after the last published episode.
@@ -97,7 +98,8 @@ def record(
     """
     spec = find(task).with_options(dict(options or {}))
     features = dataset_features(spec)
-    _check_numbers(episodes, split, noise, workers, block)
+    check_workers(workers)
+    _check_numbers(episodes, split, noise, block)
     root = Path(out)
     metadata = DatasetMetadata(
         task=task,
@@ -232,7 +234,7 @@ class _Tracker:
         )
 
 
-def _check_numbers(episodes: int, split: str, noise: float, workers: int, block: int) -> None:
+def _check_numbers(episodes: int, split: str, noise: float, block: int) -> None:
     """Refuses counts and noise that make no sense."""
     if episodes < 1:
         raise OptionError(f"episodes is {episodes}; record at least 1")
@@ -246,8 +248,6 @@ def _check_numbers(episodes: int, split: str, noise: float, workers: int, block:
         )
     if not math.isfinite(noise) or noise < 0.0:
         raise OptionError(f"noise is {noise}; use a standard deviation in rad from 0 up")
-    if workers < 1:
-        raise OptionError(f"workers is {workers}; use at least 1 process")
     if block < 1:
         raise OptionError(f"block is {block}; publish every 1 or more episodes")
 

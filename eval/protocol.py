@@ -13,7 +13,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
-from hvs_suite import files, registry, rollout
+from hvs_suite import executor, files, registry, rollout
 from hvs_suite.errors import OptionError, ScenarioError
 from hvs_suite.eval.scoring import action_log, contender, progress_file, provenance, result_file
 from hvs_suite.eval.scoring.contender import Contender
@@ -44,7 +44,7 @@ def evaluate(
     split: str = TEST_SPLIT,
     episodes: int = TEST_SCENARIOS,
     options: Mapping[str, Any] = catalogue.AS_NAMED,
-    workers: int = 1,
+    workers: executor.Workers = 1,
     decision_limit_s: float = DECISION_LIMIT_S,
     progress: Progress | None = None,
 ) -> result_file.Result:
@@ -64,7 +64,7 @@ def evaluate(
         episodes: Scenarios to play: 0 to `episodes` - 1.
         options: Options of the task that differ from the named one, for studies; only the task as
             named is a score.
-        workers: Processes; the episodes are the same for any number.
+        workers: Processes, or others elsewhere; the episodes are the same whoever plays them.
         decision_limit_s: Time after which a decision loses its episode (s).
         progress: Called after each episode, in the order in which they end; at once for those that
             an interrupted call left.
@@ -111,7 +111,7 @@ def evaluate(
             progress,
         )
         trials = [kept.trials[index] for index in range(episodes)]
-        result, log = evaluation.result(trials, _timings(trials, wall_s, workers))
+        result, log = evaluation.result(trials, _timings(trials, wall_s, executor.size(workers)))
         if out is not None:
             _write(result, log, out)
         kept.remove()
@@ -204,11 +204,10 @@ class _Evaluation:
         return result, log
 
 
-def _check_counts(split: str, episodes: int, workers: int) -> None:
+def _check_counts(split: str, episodes: int, workers: executor.Workers) -> None:
+    executor.check_workers(workers)
     if episodes < 1:
         raise OptionError(f"episodes must be at least 1, not {episodes}")
-    if workers < 1:
-        raise OptionError(f"workers must be at least 1, not {workers}")
     if split == TEST_SPLIT and episodes > TEST_SCENARIOS:
         raise ScenarioError(
             f"split {TEST_SPLIT!r} holds {TEST_SCENARIOS} scenarios, not {episodes}; ask for "

@@ -53,6 +53,10 @@ class ServerError(HvsError, ConnectionError):
     """A policy server that cannot be reached, breaks off, or speaks another protocol."""
 
 
+class ClusterError(HvsError, RuntimeError):
+    """A Ray cluster that cannot be joined, or whose machines do not hold what this one holds."""
+
+
 def describe(error: BaseException) -> str:
     """Returns the name and the text of an error, even of one whose own text raises.
 

@@ -15,6 +15,7 @@ import hvs_suite.tasks.align
 import hvs_suite.tasks.clutter
 import hvs_suite.tasks.insert
 import hvs_suite.tasks.sequence
+import hvs_suite.tasks.surface
 import hvs_suite.tasks.track  # noqa: F401 - each registers its tasks
 from hvs_suite.errors import OptionError, UnknownTaskError
 from hvs_suite.tasks.shared import family

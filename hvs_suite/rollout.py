@@ -1,38 +1,26 @@
-"""The one executor: runs anything with ``reset`` and ``select_action`` over given scenarios.
+"""Plays anything with ``reset`` and ``select_action`` over given scenarios.
 
-Evaluation, recording and DAgger all go through `rollout`. A scenario is a pure function of its
-index, so the result does not depend on how many workers there are or which one plays what.
-This module imports no room: environments and policies come in as factories.
+Evaluation, recording and DAgger all go through `play`. A scenario is a pure function of its index,
+so the result does not depend on how many workers there are, where they are, or which one plays
+what. This module imports no room: environments and policies come in as factories.
 """
 
 import contextlib
 import dataclasses
-import multiprocessing
-import os
 import random
-import signal
 import sys
-import threading
+import tempfile
 import time
-import traceback
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from multiprocessing.connection import Connection, wait
-from multiprocessing.context import SpawnProcess
-from multiprocessing.reduction import ForkingPickler
-from typing import Any, Protocol, cast, runtime_checkable
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, cast, runtime_checkable
 
 import dm_env
 import numpy as np
 import numpy.typing as npt
 
-from hvs_suite.errors import ActionError, HvsError, OptionError
-
-# One core a worker: llvmpipe's and OpenMP's own threads would fight over the same cores. Both are
-# read when the libraries load, hence set before a worker starts.
-WORKER_ENVIRONMENT = {"LP_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-WORKER_EXIT_TIMEOUT_S = 10.0
-_TOLD_AHEAD = 3
-"""Indices that a worker holds, the one it plays included."""
+from hvs_suite.errors import ActionError
+from hvs_suite.executor import Note, Workers, spread
 
 Observation = Mapping[str, npt.NDArray[Any]]
 Action = npt.NDArray[np.float32]
@@ -184,7 +172,7 @@ def rollout(
     make_policy: PolicyFactory,
     scenarios: Iterable[int],
     *,
-    workers: int = 1,
+    workers: Workers = 1,
     on_episode: Callable[[Episode], None] | None = None,
 ) -> list[Episode]:
     """Plays every scenario once; the same episodes for any number of workers.
@@ -193,7 +181,7 @@ def rollout(
         make_env: Builds the environment, once a worker.
         make_policy: Builds the policy for it, once a worker.
         scenarios: Indices, in any order.
-        workers: Processes; 1 plays in this one.
+        workers: Processes; 1 plays in this one. Or others elsewhere.
         on_episode: Called here after each episode, in the order in which they end.
 
     Returns:
@@ -221,7 +209,7 @@ def play[T](
     scenarios: Iterable[int],
     run: Callable[[Any, Policy, int], T],
     *,
-    workers: int = 1,
+    workers: Workers = 1,
 ) -> Generator[T, None, None]:
     """Runs ``run(env, policy, scenario)`` over scenarios and yields results as they come.
 
@@ -233,30 +221,82 @@ def play[T](
         make_env: Builds the environment, once a worker.
         make_policy: Builds the policy for it, once a worker.
         scenarios: Indices; handed out in this order.
-        run: Module-level function or dataclass; its result travels by pipe.
-        workers: Processes; 1 plays in this one, in order.
+        run: Module-level function or dataclass; its result travels.
+        workers: Processes; 1 plays in this one, in order. Or others elsewhere.
 
     Yields:
         One result a scenario, in the order in which they end.
 
     Raises:
         OptionError: `workers` is below 1, or something cannot be sent to another process.
+        ClusterError: Workers elsewhere cannot be had.
         HvsError: Whatever typed error a factory or a run raised, in whichever process.
         RuntimeError: Any other failure of a worker, its traceback as a note.
     """
-    if workers < 1:
-        raise OptionError(f"workers must be at least 1, not {workers}")
-    indices = [int(scenario) for scenario in scenarios]
-    workers = min(workers, len(indices))
-    if workers > 1:
-        yield from _play_in_processes((make_env, make_policy, run), indices, workers)
-    elif workers == 1:
-        with contextlib.closing(make_env()) as env:
-            policy = make_policy(env)
-            for scenario in indices:
+    if not isinstance(workers, int):
+        make_policy = carried(make_policy)
+    yield from spread(_Play(make_env, make_policy, run), scenarios, workers=workers)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Play[T]:
+    """Makes a worker that plays scenarios, for :func:`hvs_suite.executor.spread`."""
+
+    make_env: EnvFactory
+    make_policy: PolicyFactory
+    run: Callable[[Any, Policy, int], T]
+
+    @contextlib.contextmanager
+    def __call__(self, note: Note) -> Iterator[Callable[[int], T]]:
+        with contextlib.closing(self.make_env()) as env:
+            policy = self.make_policy(env)
+
+            def play_one(scenario: int) -> T:
                 with one_torch_thread():
-                    result = run(env, policy, scenario)
-                yield result
+                    return self.run(env, policy, scenario)
+
+            yield play_one
+
+
+@runtime_checkable
+class ReadsFolder(Protocol):
+    """A factory, a dataclass, that reads the files of a folder when it is called."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+    folder: str
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Builds what it builds."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Carried:
+    """A factory that `ReadsFolder`, with the folder's files, for machines without that folder."""
+
+    factory: ReadsFolder
+    files: Mapping[str, bytes]
+
+    def __call__(self, *arguments: Any) -> Any:
+        with tempfile.TemporaryDirectory(prefix="hvs-policy-") as folder:
+            for name, content in self.files.items():
+                (Path(folder) / name).write_bytes(content)
+            return dataclasses.replace(self.factory, folder=folder)(*arguments)
+
+
+def carried[T](make: T) -> T:
+    """A factory that needs no file of this machine.
+
+    Args:
+        make: If it `ReadsFolder`, or is a dataclass around one that does, what lies in the folder
+            travels with it, but for sub-folders, where trainings keep what no policy reads.
+    """
+    if not dataclasses.is_dataclass(make) or isinstance(make, type):
+        return make
+    if not isinstance(make, ReadsFolder):
+        inside = {field.name: getattr(make, field.name) for field in dataclasses.fields(make)}
+        return dataclasses.replace(make, **{name: carried(each) for name, each in inside.items()})
+    paths = sorted(path for path in Path(make.folder).iterdir() if path.is_file())
+    return cast("T", _Carried(make, {path.name: path.read_bytes() for path in paths}))
 
 
 def _checked(action: Any, shape: Sequence[int], scenario: int, step: int) -> Action:
@@ -320,132 +360,3 @@ def one_torch_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-type _Job = tuple[EnvFactory, PolicyFactory, Callable[[Any, Policy, int], Any]]
-
-
-def _play_in_processes(job: _Job, scenarios: list[int], workers: int) -> Generator[Any, None, None]:
-    """Hands indices to spawned workers one by one, and ends every worker whatever happens."""
-    try:
-        ForkingPickler.dumps(job)
-    except Exception as error:
-        raise OptionError(
-            f"with several workers, factories travel to other processes, and this one cannot "
-            f"({error}): define it at module level, or use workers=1"
-        ) from error
-    started: list[tuple[SpawnProcess, Connection]] = []
-    try:
-        with worker_conditions():
-            for _ in range(workers):
-                started.append(_start_worker(job))
-        processes = {connection: process for process, connection in started}
-        waiting = iter(scenarios)
-        # What each worker was told and has not answered: always some, so that it plays on while
-        # the caller looks at what it played before.
-        told = dict.fromkeys(processes, 0)
-        for connection in [*processes] * _TOLD_AHEAD:
-            told[connection] += _send_next(connection, waiting)
-        while busy := [connection for connection, count in told.items() if count]:
-            for ready in wait(busy):
-                connection = cast("Connection", ready)
-                result = _receive(connection, processes)
-                told[connection] += _send_next(connection, waiting) - 1
-                yield result
-        for process, _ in started:
-            process.join(WORKER_EXIT_TIMEOUT_S)
-    finally:
-        for process, connection in started:
-            connection.close()
-            if process.is_alive():
-                process.terminate()
-        for process, _ in started:
-            process.join(WORKER_EXIT_TIMEOUT_S)
-            if process.is_alive():
-                process.kill()
-                process.join()
-            process.close()
-
-
-@contextlib.contextmanager
-def worker_conditions() -> Iterator[None]:
-    """Environment variables and signals as a new worker shall inherit them.
-
-    A worker ignores Ctrl-C from its first instruction on: the terminal sends it to the whole
-    group, and only the process that asked for the work should answer.
-    """
-    before = {name: os.environ.get(name) for name in WORKER_ENVIRONMENT}
-    in_main_thread = threading.current_thread() is threading.main_thread()
-    handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if in_main_thread else None
-    os.environ.update(WORKER_ENVIRONMENT)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-        if in_main_thread:
-            signal.signal(signal.SIGINT, handler)
-
-
-def _start_worker(job: _Job) -> tuple[SpawnProcess, Connection]:
-    """Starts one worker; returns it and our end of its pipe."""
-    context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe()
-    process = context.Process(target=_work, args=(theirs, job), daemon=True)
-    process.start()
-    # With our copy closed, a worker that dies is seen as the end of the stream.
-    theirs.close()
-    return process, ours
-
-
-def _send_next(connection: Connection, waiting: Iterator[int]) -> bool:
-    """Sends the next index, or the end; False at the end. A dead worker is found on receiving."""
-    scenario = next(waiting, None)
-    with contextlib.suppress(OSError):
-        connection.send(scenario)
-    return scenario is not None
-
-
-def _receive(connection: Connection, processes: Mapping[Connection, SpawnProcess]) -> Any:
-    """Returns a worker's result, or raises what it raised."""
-    try:
-        kind, *content = connection.recv()
-    except (EOFError, OSError):
-        process = processes[connection]
-        process.join(WORKER_EXIT_TIMEOUT_S)
-        raise RuntimeError(
-            f"A rollout worker ended with exit code {process.exitcode} before its result came; "
-            "a negative code is the signal that ended it (-9: most likely out of memory)."
-        ) from None
-    if kind == "result":
-        return content[0]
-    error_type, text, trace = content
-    if error_type is not None:
-        raise error_type(text)
-    error = RuntimeError(f"A rollout worker failed: {text}")
-    error.add_note(f"In the worker:\n{trace}")
-    raise error
-
-
-def _work(connection: Connection, job: _Job) -> None:
-    """A worker's life: build, play what it is told until the end is told, close."""
-    make_env, make_policy, run = job
-    try:
-        with contextlib.closing(make_env()) as env:
-            policy = make_policy(env)
-            while (scenario := connection.recv()) is not None:
-                with one_torch_thread():
-                    result = run(env, policy, scenario)
-                connection.send(("result", result))
-    except Exception as error:
-        report = (
-            ("error", type(error), str(error), "")
-            if isinstance(error, HvsError)
-            else ("error", None, f"{type(error).__name__}: {error}", traceback.format_exc())
-        )
-        # Where the pipe itself has gone, so has whoever could be told.
-        with contextlib.suppress(OSError):
-            connection.send(report)

@@ -30,6 +30,7 @@ from hvs_suite.eval.scoring.trial import (
     play_trial,
     same_outcome,
 )
+from hvs_suite.executor import Workers
 from hvs_suite.names import shown
 from hvs_suite.policies import builtin, catalogue
 from hvs_suite.rollout import Action, Observation
@@ -126,7 +127,7 @@ def verify(
     *,
     sample: int | None = None,
     nonce: str | None = None,
-    workers: int = 1,
+    workers: Workers = 1,
     progress: Callable[[], None] | None = None,
 ) -> Verdict:
     """Checks a result file against its action log and the task.
@@ -136,7 +137,7 @@ def verify(
         sample: Scenarios to play again; None plays all.
         nonce: What the sample is drawn with, to repeat a draw; a new one by default, since whoever
             made the file must not know it.
-        workers: Processes that share the work.
+        workers: Processes that share the work, or others elsewhere.
         progress: Called after each scenario.
 
     Returns:

@@ -19,7 +19,7 @@ from typing import Any
 from hvs_suite.errors import HvsError, PolicyError
 from hvs_suite.eval.serving import policy_session, wire
 from hvs_suite.eval.serving.remote_policy import RemotePolicy, hello
-from hvs_suite.rollout import WORKER_ENVIRONMENT
+from hvs_suite.executor import WORKER_ENVIRONMENT
 
 ENDED = "process ended"
 _EXIT_LIMIT_S = 1.0

@@ -17,6 +17,7 @@ from hvs_suite.errors import OptionError
 from hvs_suite.eval.scoring.comparison import Tally
 from hvs_suite.eval.scoring.result_file import Result
 from hvs_suite.eval.studies.training import SPLIT, Note, Report, train_and_judge
+from hvs_suite.executor import Workers
 from hvs_suite.policies.network.dataset import read_manifest
 from hvs_suite.registry import find
 
@@ -120,7 +121,7 @@ class Budget:
         dagger_frames: Frames a round.
         seed: Of every training.
         episodes: Scenarios of split ``dev`` that each is judged on.
-        workers: Processes that play.
+        workers: Processes that play, or others elsewhere.
     """
 
     steps: int
@@ -128,7 +129,7 @@ class Budget:
     dagger_frames: int
     seed: int
     episodes: int
-    workers: int
+    workers: Workers
 
 
 def run_study(data: Path, out: Path, names: Sequence[str], budget: Budget, report: Report) -> Study:

@@ -36,6 +36,7 @@ from hvs_suite.eval.studies.compression_figures import (
     located,
 )
 from hvs_suite.eval.studies.training import Note, Report, train_and_judge
+from hvs_suite.executor import Workers, check_workers
 from hvs_suite.files import check_writable, replacing
 from hvs_suite.policies.imitation.frame_cache import fingerprint
 from hvs_suite.policies.network.dataset import read_manifest, refuse_test_split
@@ -60,13 +61,13 @@ class Training:
         steps: Optimiser steps; 0 trains none.
         seed: Of initial weights, held-out episodes and order; the same for every setting.
         episodes: Scenarios of the split ``dev`` to play.
-        workers: Processes that play them.
+        workers: Processes that play them, or others elsewhere.
     """
 
     steps: int
     seed: int = 0
     episodes: int = 200
-    workers: int = 1
+    workers: Workers = 1
 
 
 def parse_setting(text: str) -> Encoding:
@@ -103,9 +104,9 @@ def check(encodings: Sequence[Encoding], training: Training) -> None:
         raise OptionError("a setting is named twice; name each once")
     if training.steps < 0:
         raise OptionError(f"steps must be 0 (no training) or more, not {training.steps}")
-    for name in ("episodes", "workers"):
-        if getattr(training, name) < 1:
-            raise OptionError(f"{name} must be at least 1, not {getattr(training, name)}")
+    check_workers(training.workers)
+    if training.episodes < 1:
+        raise OptionError(f"episodes must be at least 1, not {training.episodes}")
 
 
 def run_study(

@@ -9,12 +9,7 @@ no base. All lie in one folder; what is finished there is not done again.
 import contextlib
 import dataclasses
 import json
-import multiprocessing
-import os
-import queue
-import threading
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,9 +19,10 @@ from hvs_suite.errors import OptionError, OutputError
 from hvs_suite.eval.scoring.comparison import Tally
 from hvs_suite.eval.scoring.result_file import Result
 from hvs_suite.eval.studies.training import Note, Report, train_and_judge
+from hvs_suite.executor import Workers, check_workers, spread
 from hvs_suite.files import replacing
 from hvs_suite.policies.network.dataset import read_manifest
-from hvs_suite.rollout import worker_conditions
+from hvs_suite.rollout import one_torch_thread
 
 BASE = "base"
 FINETUNED, IMITATED, SCRATCH = "RL fine-tuning", "more imitation", "RL from scratch"
@@ -214,7 +210,7 @@ def run_study(
     report: Report,
     *,
     seeds: int = 3,
-    processes: int = 2,
+    workers: Workers = 2,
     on_finished: Callable[[Study], object] | None = None,
 ) -> Study:
     """Make every run, or go on where an earlier call was interrupted.
@@ -227,7 +223,8 @@ def run_study(
         budget: What every run gets.
         report: Called as the work goes on.
         seeds: Runs of everything.
-        processes: Processes that make runs side by side, each on one core.
+        workers: Processes that make runs side by side, each on one core; or others elsewhere that
+            see the same folders.
         on_finished: Called with all that is finished, each time that is more.
 
     Returns:
@@ -238,9 +235,9 @@ def run_study(
         DatasetError: The dataset cannot be trained on.
         OutputError: ``out`` cannot be written, or holds another study.
     """
-    for name, number in (("seeds", seeds), ("processes", processes)):
-        if number < 1:
-            raise OptionError(f"{name} must be at least 1, not {number}")
+    check_workers(workers)
+    if seeds < 1:
+        raise OptionError(f"seeds must be at least 1, not {seeds}")
     manifest = read_manifest(data)
     for count in counts:
         if not 2 <= count <= manifest.n_episodes:
@@ -259,9 +256,19 @@ def run_study(
         if on_finished is not None:
             on_finished(study)
 
-    maker = _Maker(data, manifest.task, out, budget, report)
     missing = [each for each in wanted if each not in finished]
-    _make_side_by_side(maker, missing, processes, keep)
+    make = _MakeFamilies(data.resolve(), manifest.task, out.resolve(), budget, missing)
+    # A family takes hours: none waits for another while a worker is free.
+    made = spread(
+        make,
+        range(len(missing)),
+        workers=workers,
+        ahead=1,
+        on_note=lambda words: report(*words),
+    )
+    with contextlib.closing(made):
+        for family in made:
+            keep(family)
     return study
 
 
@@ -281,59 +288,25 @@ def _begun(path: Path, new: Study) -> Study:
     return study
 
 
-_reports: "multiprocessing.Queue[tuple[str, float, str]]"
-"""Of a process that makes runs: where its reports go."""
-REPORTS_EVERY_S = 0.2
+@dataclasses.dataclass(frozen=True)
+class _MakeFamilies:
+    """Makes families, the runs of each one after the other, for `hvs_suite.executor.spread`."""
 
+    data: Path
+    task: str
+    out: Path
+    budget: Budget
+    families: Sequence[tuple[int, int]]
 
-def _make_side_by_side(
-    maker: "_Maker",
-    families: Sequence[tuple[int, int]],
-    processes: int,
-    keep: Callable[[Family], None],
-) -> None:
-    """Make families in several processes, the runs of each one after the other."""
-    context = multiprocessing.get_context("spawn")
-    reports: multiprocessing.Queue[tuple[str, float, str]] = context.Queue()
-    silent = dataclasses.replace(maker, report=_report)
-    with ProcessPoolExecutor(processes, context, _report_to, (reports,)) as pool:
-        with worker_conditions():
-            waiting = {pool.submit(_make_family, silent, *family) for family in families}
-        try:
-            while waiting:
-                with contextlib.suppress(queue.Empty):
-                    maker.report(*reports.get(timeout=REPORTS_EVERY_S))
-                done = {run for run in waiting if run.done()}
-                waiting -= done
-                for run in done:
-                    keep(run.result())
-        except BaseException:
-            # A run goes on where it is when the same command is given again.
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
-                process.terminate()
-            raise
+    @contextlib.contextmanager
+    def __call__(self, note: Callable[[Any], None]) -> Iterator[Callable[[int], Family]]:
+        maker = _Maker(self.data, self.task, self.out, self.budget, lambda *words: note(words))
 
+        def make(index: int) -> Family:
+            with one_torch_thread():
+                return _make_family(maker, *self.families[index])
 
-def _report_to(reports: "multiprocessing.Queue[tuple[str, float, str]]") -> None:
-    global _reports
-    _reports = reports
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    """End this process once its parent has ended, however that was killed.
-
-    It would train on for an hour otherwise, and keep the folder from whoever goes on.
-    """
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
-
-
-def _report(stage: str, share: float, words: str) -> None:
-    _reports.put((stage, share, words))
+        yield make
 
 
 def _make_family(maker: "_Maker", count: int, seed: int) -> Family:

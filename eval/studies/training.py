@@ -11,6 +11,7 @@ from hvs_suite.errors import ResultError
 from hvs_suite.eval import protocol
 from hvs_suite.eval.scoring import result_file
 from hvs_suite.eval.scoring.result_file import Result
+from hvs_suite.executor import Workers
 
 Report = Callable[[str, float, str], None]
 """Takes a stage, the share of it that is done (0 to 1) and a few words."""
@@ -30,7 +31,7 @@ def train_and_judge(
     report: Report,
     *,
     scenarios: int,
-    workers: int,
+    workers: Workers,
 ) -> Result:
     """Train a policy and play it, or go on where an earlier call was interrupted.
 
@@ -41,7 +42,7 @@ def train_and_judge(
         train: Trains into a folder, telling how it goes.
         report: Called as the work goes on.
         scenarios: How many to play.
-        workers: Processes that play.
+        workers: Processes that play, or others elsewhere.
 
     Returns:
         The result.

@@ -31,19 +31,27 @@ _FIDUCIAL_PX = 256
 class Marker(composer.Entity):
     """The target that the tool has to be placed over; its origin lies on the surface, z outward."""
 
-    def _build(self, kind: MarkerKind = "disc", diameter_m: float = 0.05) -> None:
+    def _build(
+        self,
+        kind: MarkerKind = "disc",
+        diameter_m: float = 0.05,
+        name: str = "marker",
+        half_thickness_m: float = HALF_THICKNESS_M,
+    ) -> None:
         """Builds the marker.
 
         Args:
             kind: ``disc``, ``ring`` (outer diameter as given, hole half of it) or ``fiducial`` (an
                 ArUco 4x4 marker whose sides are the diameter).
             diameter_m: Diameter or side length (m).
+            name: Of the marker, unique in the cell.
+            half_thickness_m: Half of what it is proud of the surface (m).
         """
         self.diameter_m = diameter_m
-        self._root = mjcf.RootElement(model="marker")
+        self._root = mjcf.RootElement(model=name)
         common: dict[str, Any] = {"contype": 0, "conaffinity": 0, "mass": 0, "group": 1}
         radius = diameter_m / 2
-        top = 2 * HALF_THICKNESS_M
+        top = 2 * half_thickness_m
         if kind == "fiducial":
             texture = self._root.asset.add(
                 "texture",
@@ -62,8 +70,8 @@ class Marker(composer.Entity):
                 name="marker",
                 type="box",
                 material=self._material,
-                size=[radius, radius, HALF_THICKNESS_M],
-                pos=[0, 0, HALF_THICKNESS_M],
+                size=[radius, radius, half_thickness_m],
+                pos=[0, 0, half_thickness_m],
                 **common,
             )
             return
@@ -75,8 +83,8 @@ class Marker(composer.Entity):
             name="marker",
             type="cylinder",
             material=self._material,
-            size=[radius, HALF_THICKNESS_M],
-            pos=[0, 0, HALF_THICKNESS_M],
+            size=[radius, half_thickness_m],
+            pos=[0, 0, half_thickness_m],
             **common,
         )
         if kind == "ring":
@@ -85,7 +93,7 @@ class Marker(composer.Entity):
                 name="hole",
                 type="cylinder",
                 rgba=[0.95, 0.95, 0.95, 1],
-                size=[radius * _RING_HOLE, HALF_THICKNESS_M],
+                size=[radius * _RING_HOLE, half_thickness_m],
                 pos=[0, 0, top],
                 **common,
             )

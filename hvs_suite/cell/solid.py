@@ -1,4 +1,4 @@
-"""Solids that the arm must not touch: upright boxes and cylinders, and the arm's distance to them.
+"""Solids that the arm must not touch: boxes and cylinders, and the arm's distance to them.
 
 One description serves all: a prop's geoms are made of it, a family places and sweeps it, planners
 and draws measure distances to it.
@@ -22,25 +22,38 @@ Place = tuple[float, float, float]
 
 _FIRST_FREE_LINK = 2
 """Base and link 1 stay where they stand; nothing is put there."""
+_HAND = 7
 _BALL_SPACING = 1.0
 """Distance of the balls along a link's axis, in radii: they stand out by an eighth of it."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Solid:
-    """A box or a cylinder that stands upright.
+    """A box or a cylinder; upright as a rule, and what is moved and swept always.
 
     Attributes:
         kind: Which of them.
         half: Half its sides (m); of a cylinder the radius, twice, and half the height.
         centre: Its centre (m).
         yaw: Turn about the vertical (rad).
+        lean: Rotation vector of a further turn (rad), for what does not stand upright.
+        is_faced: Whether the tool comes near it, face on: a dome over the flange, which is quicker
+            to measure, would be in the way there.
     """
 
     kind: Literal["box", "cylinder"]
     half: Place
     centre: Place = (0.0, 0.0, 0.0)
     yaw: float = 0.0
+    lean: Place = (0.0, 0.0, 0.0)
+    is_faced: bool = False
+
+    @property
+    def rotation(self) -> FloatArray:
+        """From its own axes to the base's, (3, 3)."""
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        upright = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return np.asarray(pin.exp3(np.array(self.lean)) @ upright)
 
     def moved(self, to: Sequence[float], yaw: float) -> Self:
         """The solid of a body that was put somewhere.
@@ -66,12 +79,11 @@ class Solid:
 
     def distance(self, points: FloatArray) -> FloatArray:
         """How far points (n, 3) are from its surface, (n,) m; negative inside."""
-        c, s = math.cos(self.yaw), math.sin(self.yaw)
-        x, y, z = (points - self.centre).T
+        x, y, z = ((points - self.centre) @ self.rotation).T
         if self.kind == "cylinder":
             beyond = np.stack([np.hypot(x, y) - self.half[0], np.abs(z) - self.half[2]])
         else:
-            beyond = np.abs([c * x + s * y, c * y - s * x, z]) - np.array(self.half)[:, None]
+            beyond = np.abs([x, y, z]) - np.array(self.half)[:, None]
         outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=0)
         return np.asarray(outside + np.minimum(beyond.max(axis=0), 0.0))
 
@@ -86,14 +98,19 @@ class ObstacleDistance:
     def __init__(self, solids: Sequence[Solid]) -> None:
         self._model = kinematics().model
         self._geometry = pin.GeometryModel()
-        links = [
-            self._geometry.addGeometryObject(_domed(body))
+        bodies = [
+            body
             for body in kinematics().geometry.geometryObjects
             if body.parentJoint >= _FIRST_FREE_LINK
         ]
+        domed = [self._geometry.addGeometryObject(_domed(body)) for body in bodies]
+        true_hand = [
+            self._geometry.addGeometryObject(body) if body.parentJoint == _HAND else dome
+            for body, dome in zip(bodies, domed, strict=True)
+        ]
         for number, solid in enumerate(solids):
             added = self._geometry.addGeometryObject(_geometry(f"solid-{number}", solid))
-            for link in links:
+            for link in true_hand if solid.is_faced else domed:
                 self._geometry.addCollisionPair(pin.CollisionPair(link, added))
         self._data = self._model.createData()
         self._geometry_data = self._geometry.createData()
@@ -173,6 +190,4 @@ def _domed(body: pin.GeometryObject) -> pin.GeometryObject:
 def _geometry(name: str, solid: Solid) -> pin.GeometryObject:
     a, b, h = solid.half
     shape = coal.Cylinder(a, 2.0 * h) if solid.kind == "cylinder" else coal.Box(2 * a, 2 * b, 2 * h)
-    c, s = math.cos(solid.yaw), math.sin(solid.yaw)
-    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return pin.GeometryObject(name, 0, pin.SE3(rotation, np.array(solid.centre)), shape)
+    return pin.GeometryObject(name, 0, pin.SE3(solid.rotation, np.array(solid.centre)), shape)

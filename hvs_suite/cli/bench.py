@@ -14,11 +14,13 @@ class Bench:
     whatever else the machine does slows both alike.
 
     Attributes:
-        task: A named task, such as align-easy; align-thesis with --expert or --recording.
+        task: A named task, such as align-easy; align-thesis with --expert, --recording or --ray.
         seconds: How long to measure each figure (s).
         expert: Measure the expert instead: its steps against the least that the limits of joint
             speed and acceleration allow, and the time of a decision.
         recording: Measure recording instead: its rate against bare simulation.
+        ray: Measure playing on Ray instead: its rate with two actors on this machine against that
+            of two local processes.
         episodes: Episodes that the expert plays or that are recorded.
         json: Print the figures as JSON.
         option: Parameter of the task to change for a study, such as target_diameter_m=0.03; give it
@@ -29,6 +31,7 @@ class Bench:
     seconds: float = 6.0
     expert: bool = False
     recording: bool = False
+    ray: bool = False
     episodes: int = 600
     json: bool = False
     option: tuple[str, ...] = ()
@@ -37,7 +40,7 @@ class Bench:
         """Measure and print."""
         if not self.seconds > 0:
             raise OptionError(f"--seconds must be above 0, not {self.seconds:g}")
-        demonstrations = self.expert or self.recording
+        demonstrations = self.expert or self.recording or self.ray
         if self.task is None and not demonstrations:
             raise OptionError("say what to measure: --task, such as --task align-easy")
         from hvs_suite.registry import find
@@ -59,6 +62,11 @@ class Bench:
 
             figures |= bench_recording.recording_figures(task, options, self.episodes, self.seconds)
             labels |= bench_recording.LABELS
+        if self.ray:
+            from hvs_suite.cli import bench_ray
+
+            figures |= bench_ray.ray_figures(task, options, self.episodes)
+            labels |= bench_ray.LABELS
         if not demonstrations:
             from hvs_suite.cli import bench_simulation
 

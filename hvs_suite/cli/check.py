@@ -7,12 +7,13 @@ from typing import Annotated
 import tyro
 
 from hvs_suite.cli import console
+from hvs_suite.cli.players import Players
 
 DAMAGED = 1
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Check:
+class Check(Players):
     """Check a dataset: decode every frame, hold the numbers together, play it all again.
 
     Each damaged place is one line: file, episode, frame and what is wrong. Exits with 1 if there is
@@ -21,13 +22,11 @@ class Check:
     Attributes:
         data: Root folder of the dataset.
         skip_pictures: Do not draw frames again to compare them; they are still decoded.
-        workers: Processes that share the episodes.
         json: Print what was found as JSON.
     """
 
     data: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DIR")]
     skip_pictures: bool = False
-    workers: int = 1
     json: bool = False
 
     def run(self) -> int:
@@ -37,7 +36,7 @@ class Check:
         with console.meter() as update:
             report = check_dataset(
                 self.data,
-                workers=self.workers,
+                workers=self.players(),
                 pictures=not self.skip_pictures,
                 progress=lambda done, total: update(
                     "checking", done / total, f"{done}/{total} episodes"

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hvs_suite.cli import console
+from hvs_suite.cli.players import Players
 from hvs_suite.errors import OptionError
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ MAX_COMPLAINTS = 3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Evaluate:
+class Evaluate(Players):
     """Score a policy on scenarios 0 to N-1 of a split and write every episode to a result file.
 
     Interrupted, the same command goes on. A policy that raises, answers nonsense or is too slow
@@ -35,7 +36,6 @@ class Evaluate:
             result.
         split: Scenarios to play; test holds 1000, any other name has no end.
         episodes: Number of scenarios.
-        workers: Processes that share the work; the result is the same for any number.
         decision_limit: Time after which a decision loses its episode (s).
         server: Address of a policy server, such as ws://127.0.0.1:8765; 'hvs serve' starts one.
         option: Parameter of the task to change for a study, such as target_diameter_m=0.03; give it
@@ -47,7 +47,6 @@ class Evaluate:
     policy: str
     split: str = "test"
     episodes: int = 100
-    workers: int = 1
     decision_limit: float = 10.0
     server: str | None = None
     option: tuple[str, ...] = ()
@@ -112,7 +111,7 @@ class Evaluate:
                 split=self.split,
                 episodes=self.episodes,
                 options=options,
-                workers=self.workers,
+                workers=self.players(),
                 decision_limit_s=self.decision_limit,
                 progress=note,
             )

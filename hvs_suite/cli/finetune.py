@@ -5,6 +5,7 @@ import functools
 from pathlib import Path
 from typing import Literal
 
+from hvs_suite.cli.players import on_ray
 from hvs_suite.cli.rl_session import show_run
 
 
@@ -40,6 +41,9 @@ class Finetune:
             that is rarely reached; 0 leaves the sparse reward alone.
         lost_share: Share of the episodes that play scenes again that were lost, once there are any:
             a policy that is good already learns from little else.
+        environments: How many play; they share the scenes between them.
+        ray: Let them play on a Ray cluster (docs/many-machines.md): auto for the one that this
+            machine belongs to, an address such as 10.0.0.1:6379, or local.
         updates: Updates while 40 environment steps are played; four times as many while the
             critics learn alone.
         eval_every: Environment steps between evaluations; one more comes at start and end.
@@ -66,6 +70,8 @@ class Finetune:
     gamma: float = 0.97
     shaping: float = 0.01
     lost_share: float = 0.0
+    environments: int = 2
+    ray: str | None = None
     updates: int = 20
     eval_every: int = 10_000
     eval_episodes: int = 100
@@ -90,6 +96,7 @@ class Finetune:
             shaping=self.shaping,
             lost_share=self.lost_share,
             updates=self.updates,
+            environments=self.environments,
         )
         options = registry.find(self.task).options_from_text(self.option)
         base = checkpoint_folder(self.policy, self.task)
@@ -103,6 +110,7 @@ class Finetune:
             seed=self.seed,
             settings=settings,
             options=options,
+            cluster=None if self.ray is None else on_ray(self.ray, self.environments),
             curriculum=self.curriculum,
             eval_every=self.eval_every,
             eval_episodes=self.eval_episodes,

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hvs_suite.cli import console
+from hvs_suite.cli.players import Players
 
 if TYPE_CHECKING:
     from hvs_suite.policies.imitation.pretrain import Progress
@@ -15,7 +16,7 @@ DEFAULT_MINUTES = 10.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Pretrain:
+class Pretrain(Players):
     """Train the hvs policy on demonstrations by behaviour cloning.
 
     The task comes from the dataset. Trains for --minutes or --steps, whichever ends first, or for
@@ -39,7 +40,6 @@ class Pretrain:
             and logarithmically above; five times the task's tightest tolerance by default.
         eyes: Policy to begin with the eyes of, where a target is too small for fresh ones to find:
             a checkpoint folder, or a named task for the weights shipped for it.
-        workers: Processes that play the rounds.
         seed: Of initial weights, held-out episodes and order.
     """
 
@@ -55,7 +55,6 @@ class Pretrain:
     keypoint_weight: float = 1.0
     error_scale: float | None = None
     eyes: str | None = None
-    workers: int = 2
     seed: int = 0
 
     def run(self) -> None:
@@ -79,7 +78,7 @@ class Pretrain:
                 keypoint_weight=self.keypoint_weight,
                 error_scale=self.error_scale,
                 eyes=None if self.eyes is None else _folder(self.eyes),
-                workers=self.workers,
+                workers=self.players(local=2),
                 seed=self.seed,
                 on_progress=lambda state: update(state.stage, state.share, _words(state)),
             )

@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from hvs_suite.cli import console
+from hvs_suite.cli.players import Players
 
 if TYPE_CHECKING:
     from hvs_suite.datasets.recorder import Progress
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Record:
+class Record(Players):
     """Record demonstrations of the expert as a LeRobot dataset.
 
     Plays scenarios 0 to N-1 of the split; failures are kept and marked.
@@ -28,7 +29,6 @@ class Record:
             near the goal.
         noise: Standard deviation of a disturbance of the executed joint targets, far from the goal
             (rad); the expert's own action stays the label.
-        workers: Processes that play episodes.
         option: Parameter of the task to change for a study, such as target_diameter_m=0.03; give it
             several times for several. The dataset says so, and is not one of the named task then.
     """
@@ -40,7 +40,6 @@ class Record:
     resume: bool = False
     start: Literal["zero", "random", "near_goal", "mixed"] | None = None
     noise: float = 0.0
-    workers: int = 1
     option: tuple[str, ...] = ()
 
     def run(self) -> None:
@@ -57,7 +56,7 @@ class Record:
                 self.split,
                 self.out,
                 options,
-                workers=self.workers,
+                workers=self.players(),
                 noise=self.noise,
                 resume=self.resume,
                 progress=lambda state: update(

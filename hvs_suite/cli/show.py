@@ -215,7 +215,7 @@ def verdict(check: "Check") -> str:
 
 def _draw_table(put_text: Any, top: float, left: float, certificate: "Certificate") -> None:
     """Write the certificate's checks, one line each."""
-    columns = (left, left + 6.9, left + 8.9, left + 11.0)
+    columns = (left, left + 7.2, left + 9.1, left + 11.0)
     for x, heading in zip(columns, (title(certificate), "found", "needed", ""), strict=True):
         put_text(x, top, heading, size=9.5, weight="bold", color=INK)
     for index, check in enumerate(certificate.checks):

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import tyro
 
 from hvs_suite.cli import console
+from hvs_suite.cli.players import Players, players
 from hvs_suite.errors import OptionError
 
 # As `hvs demo` records: without disturbance and starts near the goal nothing is learnt.
@@ -14,7 +15,7 @@ NOISE_RAD = 0.02
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Compression:
+class Compression(Players):
     """Measure what video compression costs against lossless PNG.
 
     Each setting's videos are made with LeRobot's own conversion and decoded again. Reported are
@@ -32,7 +33,6 @@ class Compression:
         steps: Optimiser steps of each setting's policy; 0 trains none.
         episodes: Scenarios that each policy is judged on.
         seed: Of every policy's weights and order.
-        workers: Processes that record and judge.
     """
 
     out: Path
@@ -43,7 +43,6 @@ class Compression:
     steps: int = 1500
     episodes: int = 200
     seed: int = 0
-    workers: int = 2
 
     def run(self) -> None:
         """Measure, showing how it goes; write and print what was found."""
@@ -53,7 +52,7 @@ class Compression:
         check_writable(self.out / "study.json")
         settings = self.setting or compression.DEFAULT_SETTINGS
         encodings = [compression.parse_setting(text) for text in settings]
-        training = compression.Training(self.steps, self.seed, self.episodes, self.workers)
+        training = compression.Training(self.steps, self.seed, self.episodes, self.players(local=2))
         compression.check(encodings, training)
         data = self._recorded() if self.data is None else self.data
         with console.meter() as update:
@@ -74,14 +73,15 @@ class Compression:
             out=data,
             start="mixed",
             noise=NOISE_RAD,
-            workers=self.workers,
+            workers=self.workers or (2 if self.ray is None else None),
+            ray=self.ray,
             resume=True,
         ).run()
         return data
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Ablation:
+class Ablation(Players):
     """Measure what each choice of the hvs policy buys, by training without it.
 
     Every policy learns from the same data with the same seed and steps, and is judged on the same
@@ -97,7 +97,6 @@ class Ablation:
         dagger_frames: Frames a round.
         episodes: Scenarios that each policy is judged on.
         seed: Of every policy's weights and order.
-        workers: Processes that play.
     """
 
     data: Path
@@ -108,7 +107,6 @@ class Ablation:
     dagger_frames: int = 6000
     episodes: int = 200
     seed: int = 0
-    workers: int = 2
 
     def run(self) -> None:
         """Train and judge, showing how it goes; write and print what was found."""
@@ -122,7 +120,7 @@ class Ablation:
             dagger_frames=self.dagger_frames,
             seed=self.seed,
             episodes=self.episodes,
-            workers=self.workers,
+            workers=self.players(local=2),
         )
         rows = self.row or tuple(ablation.ABLATIONS)
         with console.meter() as update:
@@ -155,7 +153,10 @@ class FewDemonstrations:
         eye_steps: Optimiser steps of each of them.
         seeds: Runs of everything.
         episodes: Scenes of split dev that bases and ends are judged on.
-        processes: Processes that make runs side by side, each on one core.
+        processes: Processes that make runs side by side, each on one core; without it 2, or with
+            --ray one for each core of the cluster.
+        ray: Make runs on a Ray cluster, whose machines see DATA and OUT under the same names
+            (docs/many-machines.md): auto, an address such as 10.0.0.1:6379, or local.
     """
 
     data: Path
@@ -169,7 +170,8 @@ class FewDemonstrations:
     eye_steps: int = 500
     seeds: int = 3
     episodes: int = 200
-    processes: int = 2
+    processes: int | None = None
+    ray: str | None = None
 
     def run(self) -> None:
         """Train and judge, showing how it goes; write and print what was found."""
@@ -203,7 +205,7 @@ class FewDemonstrations:
                 budget,
                 update,
                 seeds=self.seeds,
-                processes=self.processes,
+                workers=players(self.processes, self.ray, local=2),
                 on_finished=write,
             )
         _say(self.out, write(study))

@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 
 from hvs_suite.cli import console
+from hvs_suite.cli.players import Players
 from hvs_suite.errors import ResultError, UnknownTaskError
 from hvs_suite.names import shown
 
@@ -15,7 +16,7 @@ BROKEN = 1
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Verify:
+class Verify(Players):
     """Play the logged actions of results again, without pictures, and recompute every number.
 
     Exits with 1 and the reason if a file is not what it says it is.
@@ -26,7 +27,6 @@ class Verify:
         nonce: What to draw the sample with, to repeat a draw that was printed.
         submission: Also hold the files against the rules of the board (eval/SUBMITTING.md).
         results: With --submission, the folder that holds <policy>/<task>.json.
-        workers: Processes that share the work.
         json: Print what was found as JSON.
     """
 
@@ -35,7 +35,6 @@ class Verify:
     nonce: str | None = None
     submission: bool = False
     results: Path = Path("eval/results")
-    workers: int = 1
     json: bool = False
 
     def run(self) -> int:
@@ -56,7 +55,7 @@ class Verify:
                         path,
                         sample=self.sample,
                         nonce=self.nonce,
-                        workers=self.workers,
+                        workers=self.players(),
                         progress=advance,
                     )
                 found.append(verification.as_json(path, verdict))

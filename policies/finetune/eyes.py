@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from hvs_suite.datasets.features import dataset_features
+from hvs_suite.executor import Workers
 from hvs_suite.policies.finetune.folding import load_base, write_folded
 from hvs_suite.policies.finetune.settings import Settings
 from hvs_suite.policies.finetune.stage import MakeStage
@@ -49,6 +50,7 @@ def train_eyes(
     spec: Spec,
     evaluate: Callable[[Path, int, int], Evaluation],
     on_share: Callable[[str, float], None],
+    workers: Workers,
 ) -> Path:
     """Let the policy play and train its eyes on what it saw, round by round.
 
@@ -62,12 +64,13 @@ def train_eyes(
             ``evaluations.json``, of the base and of each round.
         spec: The task.
         evaluate: Evaluates a checkpoint, given the frames played and the optimiser steps so far.
+        workers: Who plays.
         on_share: Called with ``looking`` or ``training eyes``, and the share of it that is done.
 
     Returns:
         The checkpoint that solved most; of equals the last, and the base if there are no rounds.
     """
-    base, seed, settings = run.base, run.seed, run.settings
+    base, seed, settings = Path(run.folder), run.seed, run.settings
     results = folder / "evaluations.json"
     evaluations = read_evaluations(results, sys.maxsize)
 
@@ -88,7 +91,9 @@ def train_eyes(
     for number in range(settings.eye_rounds):
         began = time.perf_counter()
         place = folder / f"round-{number + 1}"
-        summary, recording = _look(manifest, best, place / "frames", scene, settings, on_share)
+        summary, recording = _look(
+            manifest, best, place / "frames", scene, settings, on_share, workers
+        )
         scene = summary.next_scenario
         pool.add(recording)
         improved = place / "checkpoint"
@@ -111,6 +116,7 @@ def _look(
     first_scenario: int,
     settings: Settings,
     on_share: Callable[[str, float], None],
+    workers: Workers,
 ) -> tuple[RoundSummary, Recording]:
     """Let a checkpoint play a round, unless it was played; what came of it, and its frames."""
     if (found := read_round(frames)) is not None:
@@ -129,7 +135,7 @@ def _look(
         frames,
         frames=settings.eye_frames,
         first_scenario=first_scenario,
-        workers=settings.environments,
+        workers=workers,
         labelled=False,
         on_frames=note,
     )

@@ -181,7 +181,7 @@ class MakeStage:
         options: Task options that differ from it.
         levels: Further options, of each level of the curriculum.
         split: Stream of scenes.
-        base: Checkpoint that plays.
+        folder: Checkpoint that plays.
         settings: Of the run.
         seed: Of the run.
         part: Which of the environments it is.
@@ -191,7 +191,7 @@ class MakeStage:
     options: Mapping[str, Any]
     levels: list[dict[str, Any]]
     split: str
-    base: Path
+    folder: str
     settings: Settings
     seed: int
     part: int = 0
@@ -203,7 +203,7 @@ class MakeStage:
         # The monitor inside: it sees the task's own rewards.
         stage = ResidualStage(
             Monitor(env, info_keywords=OUTCOMES),
-            self.base,
+            Path(self.folder),
             settings.bound,
             settings.shaping,
             settings.gamma,

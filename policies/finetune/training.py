@@ -18,6 +18,8 @@ import numpy as np
 import torch
 from stable_baselines3.common.noise import NormalActionNoise
 
+from hvs_suite.executor import worker_conditions
+from hvs_suite.on_ray import RayCluster
 from hvs_suite.policies.catalogue import name_of
 from hvs_suite.policies.checkpoints.files import read_config
 from hvs_suite.policies.checkpoints.loading import (
@@ -44,7 +46,7 @@ from hvs_suite.policies.training.budget import Budget
 from hvs_suite.policies.training.process import prepare_process
 from hvs_suite.policies.training.run_folder import claimed, write_train_config
 from hvs_suite.registry import find, options_of
-from hvs_suite.rollout import library_seeds, worker_conditions
+from hvs_suite.rollout import library_seeds
 from hvs_suite.tasks.shared.spec import Spec
 
 PACKAGES = ("hvs-suite", "mujoco", "numpy", "stable-baselines3", "torch")
@@ -60,6 +62,7 @@ def finetune(
     seed: int = 0,
     settings: Settings | None = None,
     options: Mapping[str, Any] | None = None,
+    cluster: RayCluster | None = None,
     curriculum: Kind | None = None,
     split: str = "train",
     eval_every: int = 10_000,
@@ -80,6 +83,7 @@ def finetune(
         seed: Of weights, scenes, exploration and batches; below 2^32.
         settings: Of the method.
         options: Task options that differ from the named task's, for studies.
+        cluster: Where the environments play, if not in processes of this machine.
         curriculum: Learn on easier tasks first, ``tolerance`` or ``start``, see `levels_of`;
             evaluations are of the task itself.
         split: Stream of scenes to learn from; anything but ``test``.
@@ -96,6 +100,7 @@ def finetune(
         PolicyError: The policy cannot be fine-tuned, or does not fit the task.
         OptionError: No budget, or a value that makes no sense.
         OutputError: ``out`` cannot be written, or holds something else than this run.
+        ClusterError: The cluster cannot be joined, or lost a machine that played.
     """
     settings = settings or Settings()
     spec = find(task).with_options(options or {})
@@ -106,16 +111,8 @@ def finetune(
     check_fit(read_config(policy), policy, spec)
     load_base(policy)
     prepare_process()
-    identity = {
-        "base": weights_digest(policy),
-        "task": task,
-        "task_version": spec.version,
-        "options": options,
-        "curriculum": curriculum,
-        "split": split,
-        "seed": seed,
-        **dataclasses.asdict(settings),
-    }
+    make = MakeStage(task, options, levels, split, str(policy.resolve()), settings, seed)
+    identity = _identity(make, spec, curriculum)
     with contextlib.ExitStack() as stack:
         stack.enter_context(claimed(out, identity))
         budget = {"minutes": minutes, "steps": steps}
@@ -123,21 +120,36 @@ def finetune(
         # Torch and SB3 draw from the global generators of NumPy and torch.
         stack.enter_context(library_seeds(seed))
         evaluator = stack.enter_context(contextlib.closing(Evaluator(spec, options, eval_episodes)))
-        make = MakeStage(task, options, levels, split, policy, settings, seed)
-        base = _with_new_eyes(make, out / "training" / "eyes", spec, evaluator, on_progress)
-        learner = stack.enter_context(_learner(dataclasses.replace(make, base=base), out, spec))
+        base = _with_new_eyes(make, out, spec, evaluator, on_progress, cluster)
+        make = dataclasses.replace(make, folder=str(base.resolve()))
+        learner = stack.enter_context(_learner(make, out, spec, cluster))
         run = Run(out, learner, evaluator, on_progress)
         stack.callback(run.close)
         run.train(limit, settings.collect_steps, eval_every, checkpoint_period_s)
         return run.outcome()
 
 
+def _identity(make: MakeStage, spec: Spec, curriculum: Kind | None) -> dict[str, Any]:
+    """What a run is a function of, but for its length."""
+    return {
+        "base": weights_digest(Path(make.folder)),
+        "task": make.task,
+        "task_version": spec.version,
+        "options": make.options,
+        "curriculum": curriculum,
+        "split": make.split,
+        "seed": make.seed,
+        **dataclasses.asdict(make.settings),
+    }
+
+
 def _with_new_eyes(
     make: MakeStage,
-    folder: Path,
+    out: Path,
     spec: Spec,
     evaluator: Evaluator,
     on_progress: Callable[[Progress], None] | None,
+    cluster: RayCluster | None,
 ) -> Path:
     """The base with the eyes that RL is to begin with: its own, or better ones."""
 
@@ -153,23 +165,36 @@ def _with_new_eyes(
             on_episode=lambda done: on_share("evaluating", done / evaluator.episodes),
         )
 
-    return train_eyes(make, folder, spec, evaluate, on_share)
+    return train_eyes(
+        make,
+        out / "training" / "eyes",
+        spec,
+        evaluate,
+        on_share,
+        cluster or make.settings.environments,
+    )
 
 
 @contextlib.contextmanager
-def _learner(make: MakeStage, out: Path, spec: Spec) -> Iterator["_Finetuned"]:
+def _learner(
+    make: MakeStage, out: Path, spec: Spec, cluster: RayCluster | None
+) -> Iterator["_Finetuned"]:
     """The model on its environments, which are closed in the end."""
     if make.settings.environments > 1:
         # They and the learner play and learn at the same time.
         torch.set_num_threads(1)
-    with contextlib.closing(_environments(make)) as environments:
-        model = _make_model(environments, load_base(make.base), make.settings, make.seed)
-        yield _Finetuned(model, make.base, out, spec)
+    with contextlib.closing(_environments(make, cluster)) as environments:
+        model = _make_model(environments, load_base(Path(make.folder)), make.settings, make.seed)
+        yield _Finetuned(model, Path(make.folder), out, spec)
 
 
-def _environments(make: MakeStage) -> Overlapped:
-    """All environments of a run: a process each, or this one for a single one."""
+def _environments(make: MakeStage, cluster: RayCluster | None) -> Overlapped:
+    """All environments of a run: an actor or a process each, or this one for a single one."""
     parts = [dataclasses.replace(make, part=i) for i in range(make.settings.environments)]
+    if cluster is not None:
+        from hvs_suite.policies.finetune.on_ray import OverlappedRayVecEnv
+
+        return OverlappedRayVecEnv(cluster, parts)
     if len(parts) == 1:
         return OverlappedDummyVecEnv([*parts])
     with worker_conditions():

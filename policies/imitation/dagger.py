@@ -19,13 +19,16 @@ import numpy.typing as npt
 from hvs_suite.datasets.demonstration import MakeEnvironment
 from hvs_suite.datasets.features import ACTION, ACTION_EXECUTED, Frame, observed_part
 from hvs_suite.datasets.looking import Demonstrator
+from hvs_suite.datasets.png import encode
 from hvs_suite.datasets.recorder import in_order
-from hvs_suite.errors import OutputError
+from hvs_suite.errors import DatasetError, OutputError
+from hvs_suite.executor import Workers
 from hvs_suite.policies.checkpoints.loading import CheckpointFactory
 from hvs_suite.policies.imitation.demonstrations import Recording
 from hvs_suite.policies.imitation.frame_cache import new_frames, open_frames
 from hvs_suite.policies.network.dataset import Manifest
 from hvs_suite.policies.network.network import IMAGE_PREFIX
+from hvs_suite.reading import decode_png
 from hvs_suite.rollout import Policy, play, tell
 
 if TYPE_CHECKING:
@@ -57,13 +60,16 @@ class PlayedEpisode:
 
     Attributes:
         scenario: Index in the split.
-        frames: One a control step, with the expert's ``action`` where it was asked.
+        frames: One a control step, pictures left out, with the expert's ``action`` where it was
+            asked.
+        pictures: PNG files of each camera's feature, one a frame: they may come from far away.
         success: The goal was reached.
         collision: A forbidden contact ended it.
     """
 
     scenario: int
     frames: list[Frame]
+    pictures: Mapping[str, list[bytes]]
     success: bool
     collision: bool
 
@@ -110,8 +116,10 @@ def _played(
         action = np.clip(policy.select_action(time_step.observation), -1.0, 1.0).astype(np.float32)
         frames.append(labelled | {ACTION_EXECUTED: action})
         time_step = env.step(action)
+    cameras = [key for key in frames[0] if key.startswith(IMAGE_PREFIX)]
+    pictures = {key: encode([frame.pop(key) for frame in frames]) for key in cameras}
     info = env.info
-    return PlayedEpisode(scenario, frames, info["is_success"], info["collision"])
+    return PlayedEpisode(scenario, frames, pictures, info["is_success"], info["collision"])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,7 +150,7 @@ def play_round(
     *,
     frames: int,
     first_scenario: int,
-    workers: int,
+    workers: Workers,
     labelled: bool = True,
     on_frames: Callable[[int], None] | None = None,
 ) -> RoundSummary:
@@ -154,7 +162,7 @@ def play_round(
         folder: Gets the round, whole or not at all.
         frames: How many to keep.
         first_scenario: Index to begin with; give one that the dataset does not hold.
-        workers: Processes that play. The result is the same for any number.
+        workers: Processes that play, or others elsewhere. The result is the same whoever plays.
         labelled: Ask the expert at every step what it would have done.
         on_frames: Called with the number of frames just kept.
 
@@ -183,7 +191,7 @@ def play_round(
         episodes = successes = collisions = 0
         with contextlib.closing(played):
             for episode in in_order(played, first_scenario):
-                kept = store.append(episode.frames, first_scenario + episodes)
+                kept = store.append(episode, first_scenario + episodes)
                 episodes += 1
                 successes += episode.success
                 collisions += episode.collision
@@ -241,16 +249,18 @@ class _Store:
     def is_full(self) -> bool:
         return self._filled == self._frames
 
-    def append(self, frames: list[Frame], episode: int) -> int:
+    def append(self, played: PlayedEpisode, episode: int) -> int:
         """Keep the frames that still fit; their number."""
-        kept = frames[: self._frames - self._filled]
-        for frame in kept:
-            for arrays in (self._images, self._columns):
-                for key, array in arrays.items():
-                    array[self._filled] = frame[key]
-            self._episodes[self._filled] = episode
-            self._filled += 1
-        return len(kept)
+        kept = min(len(played.frames), self._frames - self._filled)
+        rows = slice(self._filled, self._filled + kept)
+        for key, images in self._images.items():
+            for row, content in enumerate(played.pictures[key][:kept], self._filled):
+                images[row] = decode_png(content, images.shape[1:], error=DatasetError)
+        for key, column in self._columns.items():
+            column[rows] = [frame[key] for frame in played.frames[:kept]]
+        self._episodes[rows] = episode
+        self._filled += kept
+        return kept
 
     def close(self) -> None:
         for image in self._images.values():

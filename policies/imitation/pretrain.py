@@ -17,7 +17,8 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from hvs_suite.errors import OptionError, PolicyError
+from hvs_suite.errors import PolicyError
+from hvs_suite.executor import Workers, check_workers
 from hvs_suite.files import replacing
 from hvs_suite.policies.imitation.dagger import RoundSummary, play_round, read_round, round_shares
 from hvs_suite.policies.imitation.demonstrations import Demonstrations
@@ -110,7 +111,7 @@ def pretrain(
     minutes: float | None = None,
     steps: int | None = None,
     eyes: Path | None = None,
-    workers: int = 2,
+    workers: Workers = 2,
     checkpoint_period_s: float = 60.0,
     on_progress: Callable[[Progress], None] | None = None,
     **settings: Any,
@@ -124,7 +125,7 @@ def pretrain(
         minutes: Stop after this much training, decoding and DAgger rounds not counted (min).
         steps: Stop after this many optimiser steps. Give either, or both for the first reached.
         eyes: Checkpoint of a policy to take the eyes of, see `take_eyes`; None for fresh ones.
-        workers: Processes that play the rounds; any number gives the same.
+        workers: Processes that play the rounds, or others elsewhere; all give the same.
         checkpoint_period_s: Time between checkpoints (s).
         on_progress: Called while decoding and after every step.
         **settings: Fields of `Settings` that differ from the defaults.
@@ -140,8 +141,7 @@ def pretrain(
         PolicyError: The eyes do not fit, or the loss is no number any more.
     """
     budget = Budget(steps, minutes)
-    if workers < 1:
-        raise OptionError(f"workers must be at least 1, not {workers}")
+    check_workers(workers)
     manifest = read_manifest(data)
     refuse_test_split(manifest)
     chosen = settings_for(manifest, eyes, settings)
@@ -190,7 +190,7 @@ class _Rounds:
     folder: Path
     count: int
     frames: int
-    workers: int
+    workers: Workers
 
     def path(self, number: int) -> Path:
         """Folder of a round."""

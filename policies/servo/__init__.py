@@ -30,6 +30,7 @@ def make_servo(env: Playground) -> Policy:
     from hvs_suite.policies.servo.changing_target import ChangingTargetServo
     from hvs_suite.policies.servo.insertion import InsertionServo
     from hvs_suite.policies.servo.moving_target import MovingTargetServo
+    from hvs_suite.policies.servo.sloped_target import SlopedTargetServo
     from hvs_suite.policies.servo.still_target import StillTargetServo
 
     servos: dict[str, type[Any]] = {
@@ -37,6 +38,7 @@ def make_servo(env: Playground) -> Policy:
         "sequence": ChangingTargetServo,
         "track": MovingTargetServo,
         "clutter": AmongOthersServo,
+        "surface": SlopedTargetServo,
         "insert": InsertionServo,
     }
     return _made("servo", servos, env)

@@ -76,15 +76,18 @@ class Disc:
         return 2.0 * float(np.sqrt(self.area / np.pi))
 
 
-def find_discs(image: npt.NDArray[np.uint8], colour: str = "red") -> list[Disc]:
+def find_discs(
+    image: npt.NDArray[np.uint8], colour: str = "red", most: int = _MAX_DISCS
+) -> list[Disc]:
     """Find the patches of a colour.
 
     Args:
         image: RGB, uint8 (H, W, 3).
         colour: ``red``, ``blue``, ``green`` or ``yellow``.
+        most: How many at most.
 
     Returns:
-        Up to eight patches, the largest first.
+        Patches, the largest first.
     """
     found = _red_patches(image) if colour == "red" else _patches_of_hue(image, _HUES_DEG[colour])
     if found is None:
@@ -93,7 +96,7 @@ def find_discs(image: npt.NDArray[np.uint8], colour: str = "red") -> list[Disc]:
     is_target &= stats[:, cv2.CC_STAT_AREA] >= _MIN_PIXELS
     is_target[0] = False
     chosen = np.flatnonzero(is_target)
-    chosen = chosen[np.argsort(-stats[chosen, cv2.CC_STAT_AREA], kind="stable")][:_MAX_DISCS]
+    chosen = chosen[np.argsort(-stats[chosen, cv2.CC_STAT_AREA], kind="stable")][:most]
     return [_measure(image, labels, stats[each], int(each), _LEADS[colour]) for each in chosen]
 
 

@@ -15,6 +15,7 @@ from dm_env import specs
 
 from hvs_suite.cell import cameras
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
+from hvs_suite.tasks.shared import depth_noise
 
 if TYPE_CHECKING:
     from hvs_suite.tasks.shared.arm_task import ArmTask
@@ -60,10 +61,10 @@ def make_observables(task: "ArmTask") -> dict[str, observable.Observable]:
 
     Returns:
         Observables by name: ``eih``, ``eth`` uint8 (H, W, C); ``eih_depth``, ``eth_depth`` float32
-        (H, W, 1) m; ``joint_positions`` (7,) rad, ``joint_velocities`` (7,) rad/s, as measured;
-        privileged: ``flange_position``, ``goal_position`` (3,) m, ``goal_normal`` (3,); and what
-        the family adds. With ``normalise_observation`` pictures are float32 in [0, 1] and joints
-        in [-1, 1].
+        (H, W, 1) m, 0 where a noisy one has no measurement; ``joint_positions`` (7,) rad,
+        ``joint_velocities`` (7,) rad/s, as measured; privileged: ``flange_position``,
+        ``goal_position`` (3,) m, ``goal_normal`` (3,); and what the family adds. With
+        ``normalise_observation`` pictures are float32 in [0, 1] and joints in [-1, 1].
     """
     spec = task.spec
     bank = _noise_bank(spec.image_noise) if spec.image_noise > 0 else None
@@ -114,11 +115,19 @@ def _picture(task: "ArmTask", name: str, bank: npt.NDArray[np.int16] | None) -> 
 def _depth(task: "ArmTask", name: str) -> Any:
     camera = name.removesuffix("_depth")
     side = task.spec.eih_resolution if camera == "eih" else task.spec.eth_resolution
+    sigma_px = task.spec.depth_noise_px
 
     def take(physics: mjcf.Physics) -> npt.NDArray[Any]:
-        return task.environment.renderer.depth(
-            physics.data.ptr, task.cameras[camera].id, side, side
+        known = task.cameras[camera]
+        depth = task.environment.renderer.depth(physics.data.ptr, known.id, side, side)
+        if sigma_px == 0.0:
+            return depth
+        random = task.source.generator(
+            f"noise-{name}", task.scenario.index, task.environment.control_steps
         )
+        baseline_m = depth_noise.BASELINES_M[camera]
+        measured = depth_noise.as_measured(depth, known.fov_deg, baseline_m, sigma_px, random)
+        return np.minimum(measured, np.float32(DEPTH_BOUND_M))
 
     return cameras.CameraImage(
         take, specs.BoundedArray((side, side, 1), np.float32, 0.0, DEPTH_BOUND_M)

@@ -124,6 +124,8 @@ class Disturbances:
         eth_rotation_noise_deg: Standard deviation of its orientation (deg), cut at 2 sigma.
         image_noise: Standard deviation of pixel noise (grey levels of 255).
         joint_offset_deg: Standard deviation of the encoder zero error (deg), cut at 2 sigma.
+        depth_noise_px: Standard deviation of the disparities behind depth pictures (px of a sensor
+            640 px wide), which then have steps and holes as well; 0 for true depth.
     """
 
     vary_light: bool = scene(False)
@@ -133,6 +135,7 @@ class Disturbances:
     eth_rotation_noise_deg: float = scene(0.0)
     image_noise: float = scene(0.0)
     joint_offset_deg: float = scene(0.0)
+    depth_noise_px: float = 0.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -230,6 +233,7 @@ class Spec(Timing, Cameras, Disturbances):
             "eth_rotation_noise_deg",
             "image_noise",
             "joint_offset_deg",
+            "depth_noise_px",
         )
 
     def _check_cameras(self) -> None:
@@ -371,6 +375,7 @@ class Spec(Timing, Cameras, Disturbances):
             "image noise": self.image_noise > 0,
             "joint offsets": self.joint_offset_deg > 0,
             "latency": self.latency_steps > 0,
+            "depth noise": self.depth_noise_px > 0,
         }
         return Description(
             start=in_words(self.start),

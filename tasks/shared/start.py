@@ -1,13 +1,13 @@
 """Starts: where the arm stands at reset, and how soon the goal can be reached from there."""
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.cell.kinematics import Kinematics, kinematics, travel_time
 from hvs_suite.cell.robot import JOINT_NAMES, JOINT_RANGE_RAD
+from hvs_suite.cell.solid import Solid, obstacle_distance
 from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared.goal import Goal
 from hvs_suite.tasks.shared.scenario import Streams
@@ -25,12 +25,14 @@ _NEAR_GOAL_SCALE_RAD = (0.002, 0.25)
 _NEAR_GOAL_CLEARANCE_M = 0.015
 MAX_REDRAWS = 1000
 
-Clearance = Callable[[FloatArray], float]
-"""Least distance (m) of the arm from the scene and itself at joint angles (7,) rad."""
-
 
 def draw_start(
-    spec: Spec, own: Start, streams: Streams, goal: Goal, floor_normal: FloatArray
+    spec: Spec,
+    own: Start,
+    streams: Streams,
+    goal: Goal,
+    floor_normal: FloatArray,
+    solids: tuple[Solid, ...] = (),
 ) -> FloatArray:
     """Draw where the arm stands at reset.
 
@@ -39,7 +41,8 @@ def draw_start(
         own: The start of the named task, which ``mixed`` mixes with starts near the goal.
         streams: Of the scenario.
         goal: The first one.
-        floor_normal: Normal of the plane through the origin that the whole scene lies in or below.
+        floor_normal: Normal of the plane through the origin that the scene lies in or below.
+        solids: What else stands there, below the plane that touches the surface at the goal.
 
     Returns:
         True joint angles, (7,) rad.
@@ -54,7 +57,7 @@ def draw_start(
     if start == "zero":
         return np.zeros(len(JOINT_NAMES))
     if start == "random":
-        return _random_start(spec, streams, goal, floor_normal)
+        return _random_start(spec, streams, goal, floor_normal, solids)
     if start == "fixed":
         return _fixed_start(kinematics(spec.embodiment), streams, floor_normal)
     if start == "near_goal":
@@ -73,7 +76,13 @@ def _fixed_start(model: Kinematics, streams: Streams, floor_normal: FloatArray) 
     raise OptionError("no fixed start found that is clear of surface and self")
 
 
-def _random_start(spec: Spec, streams: Streams, goal: Goal, floor_normal: FloatArray) -> FloatArray:
+def _random_start(
+    spec: Spec,
+    streams: Streams,
+    goal: Goal,
+    floor_normal: FloatArray,
+    solids: tuple[Solid, ...],
+) -> FloatArray:
     model = kinematics(spec.embodiment)
     random = streams.generator("start")
     bound = RANDOM_START_RANGE * JOINT_RANGE_RAD
@@ -83,6 +92,8 @@ def _random_start(spec: Spec, streams: Streams, goal: Goal, floor_normal: FloatA
         if np.linalg.norm(model.tip_pose(q)[1] - goal.position) < START_GOAL_DISTANCE_M:
             continue
         if model.clearance(q, 0.0, floor_normal) < START_CLEARANCE_M:
+            continue
+        if solids and obstacle_distance(solids)(q) < START_CLEARANCE_M:
             continue
         if steps_lower_bound(spec, q, goal) <= steps:
             return q

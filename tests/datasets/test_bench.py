@@ -1,6 +1,8 @@
-"""``hvs bench --expert`` and ``--recording``: figures that hold together."""
+"""``hvs bench --expert``, ``--recording`` and ``--ray``: figures that hold together."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -52,3 +54,19 @@ def test_recording_is_compared_with_bare_simulation(capsys):
 def test_counts_that_say_nothing_are_refused(episodes, capsys):
     assert run(["bench", "--expert", "--episodes", episodes]) == 2
     assert "--episodes" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_playing_on_ray_is_measured_against_local_processes():
+    pytest.importorskip("ray")
+    # In a process of its own: another test may have joined another cluster in this one.
+    words = ["bench", "--task", "align-fixed", "--ray", "--episodes", "16", "--json"]
+    done = subprocess.run(
+        [sys.executable, "-c", f"from hvs_suite.cli.main import main; main({words!r})"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    figures = json.loads(done.stdout)
+    ratio = figures["ray_episodes_per_s"] / figures["local_episodes_per_s"]
+    assert figures["ray_ratio"] == pytest.approx(ratio, abs=0.01)

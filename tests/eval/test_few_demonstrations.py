@@ -188,7 +188,7 @@ def test_more_demonstrations_than_there_are_are_refused(count, tmp_path):
         run_study(SAMPLE, tmp_path, [count], BUDGET, lambda *words: None)
 
 
-@pytest.mark.parametrize("none", [{"seeds": 0}, {"processes": 0}])
+@pytest.mark.parametrize("none", [{"seeds": 0}, {"workers": 0}])
 def test_a_study_of_nothing_is_refused(none, tmp_path):
     with pytest.raises(OptionError, match=r"at least 1, not 0"):
         run_study(SAMPLE, tmp_path, [3], BUDGET, lambda *words: None, **none)

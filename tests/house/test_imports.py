@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-HEAVY = ("torch", "mujoco", "dm_control", "lerobot", "pinocchio", "matplotlib", "datasets")
+HEAVY = ("torch", "mujoco", "dm_control", "lerobot", "pinocchio", "matplotlib", "datasets", "ray")
 
 
 @pytest.mark.parametrize(

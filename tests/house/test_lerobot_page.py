@@ -58,5 +58,5 @@ def test_one_dataset_of_many_tasks_is_made_with_the_tools_of_lerobot(tmp_path, m
     tasks = {shlex.split(line)[3] for line in lines}
     assert {TASKS[task].family for task in tasks} == {spec.family for spec in TASKS.values()}
     sentences = {merged[int(row["dataset_from_index"])]["task"] for row in merged.meta.episodes}
-    assert len(sentences) == len({TASKS[task].family for task in tasks})
+    assert len(sentences) == len({TASKS[task].instruction() for task in tasks})
     assert merged[0]["observation.images.eth"].shape == (3, 168, 168)

@@ -43,13 +43,13 @@ def wheel_folder(tmp_path_factory):
 
 
 def declared_requirements():
-    """What setup.cfg asks for: the base, to learn and to develop."""
+    """What setup.cfg asks for: the base, to learn, to play on Ray and to develop."""
     from packaging.requirements import Requirement
 
     config = configparser.ConfigParser()
     config.read(ROOT / "setup.cfg", encoding="utf-8")
     texts = [config["options"]["install_requires"]]
-    texts += [config["options.extras_require"][extra] for extra in ("learn", "dev")]
+    texts += [config["options.extras_require"][extra] for extra in ("learn", "ray", "dev")]
     return [
         Requirement(line)
         for text in texts

@@ -74,6 +74,8 @@ def test_an_episode_does_not_depend_on_the_one_before(env):
         ("align-hard", 1),
         # The nearest place to hover over this target ends at a joint's stop on the way down.
         ("align-drill", 29),
+        # On a skin at any slope, which a look from straight above does not tell.
+        ("surface-hard", 3),
     ],
 )
 def test_it_solves_disturbed_tasks_and_is_told_no_disturbance(task, scenario, monkeypatch):

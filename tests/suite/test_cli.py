@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib
-import inspect
 import json
 import os
 import subprocess
@@ -32,8 +31,11 @@ def refusal(capsys, *words):
 def described(command):
     """What a command's documentation says of itself and of each of its options."""
     module, _, name = COMMANDS[command].partition(":")
-    said = docstring_parser.parse(inspect.getdoc(getattr(importlib.import_module(module), name)))
-    return said.short_description, {each.arg_name: each.description for each in said.params}
+    kind = getattr(importlib.import_module(module), name)
+    # What commands have in common is a class that they derive from, and said there.
+    said = [docstring_parser.parse(each.__doc__) for each in kind.__mro__ if each is not object]
+    params = [param for each in reversed(said) for param in each.params]
+    return said[0].short_description, {each.arg_name: each.description for each in params}
 
 
 def test_help_gives_every_command_a_line_of_its_own(capsys):
