@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.cell.embodiment import Embodiment
-from hvs_suite.cell.kinematics import kinematics
+from hvs_suite.cell.kinematics import away_from_stops, kinematics
 from hvs_suite.cell.robot import JOINT_ACCELERATION_RAD_S2, JOINT_RANGE_RAD
 from hvs_suite.datasets.planner import Planner
 from hvs_suite.tasks.shared.goal import HEIGHT, LATERAL, TILT, Goal, Tip, goal_errors
@@ -33,6 +33,7 @@ FAST_MM = 10.0
 """Least and largest step down (mm)."""
 _BRAKING = 0.4
 _CAUGHT_MM = 30.0
+_PUSHES = 6
 _STOPS_RAD = (0.0, 0.05, 0.3)
 _CLEAR_MM = 8.0
 """Nearer to the axis than the first and lower than the second, the only way is up."""
@@ -87,15 +88,19 @@ class GuardedInsertion:
     def straight(self, set_point: FloatArray, tip: FloatArray, goal: Goal) -> FloatArray:
         """The nearest set point (7,) with the tip (3,) at a place, along the goal's axis.
 
-        Where that is beyond a joint's stop, the joints near their stops stay where they are: yaw
-        and elbow are free, so the others can do without one of them.
+        Where that is beyond a joint's stop, one that is pushed away from there; else the joints
+        near their stops stay where they are: yaw and elbow are free, so the others can do without.
         """
+        pushed = [set_point]
+        for _ in range(_PUSHES):
+            pushed.append(away_from_stops(pushed[-1]))
         room = JOINT_RANGE_RAD - np.abs(set_point)
         for least in _STOPS_RAD:
             weight = JOINT_ACCELERATION_RAD_S2 * (room >= least)
-            near = self._kinematics.nearest_configuration(set_point, tip, goal.normal, weight)
-            if near is not None:
-                return near
+            for start in pushed if least == 0.0 else [set_point]:
+                near = self._kinematics.nearest_configuration(start, tip, goal.normal, weight)
+                if near is not None:
+                    return near
         return set_point
 
     def _raised(self, set_point: FloatArray, goal: Goal) -> FloatArray:

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
         "markers",
-        "each_task(*also, family=None): play every named task (of a family) as the argument task; "
+        "each_task(*also, family=None, measures=None): play every named task (of a family, or that "
+        "measures something) as the argument task; "
         "make test plays the first of each family and those that are named, the rest are slow",
     )
 
@@ -30,7 +31,12 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if marker is None:
         return
     asked = marker.kwargs.get("family")
-    families = {name: spec.family for name, spec in hvs_suite.TASKS.items()}
+    measured = marker.kwargs.get("measures")
+    families = {
+        name: spec.family
+        for name, spec in hvs_suite.TASKS.items()
+        if measured is None or measured in [metric.name for metric in spec.metrics]
+    }
     firsts = {family: name for name, family in reversed(families.items())}
     quick = {*firsts.values(), *marker.args}
     metafunc.parametrize(

@@ -81,8 +81,7 @@ def check_sight(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
         left = float(np.percentile(left_mm, 95))
         checks.append(
             Check(
-                "hidden: distance of the hole from where it is seen, 95th percentile, "
-                "against clearance and chamfer",
+                "hidden: how far the hole is from where it is seen, 95th percentile",
                 f"{left:.2f} mm",
                 f"> {catch:.2f} mm",
                 left > catch,
@@ -112,8 +111,7 @@ def check_feeling(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
     by_search, by_pushing = (100.0 * float(np.mean(solved[each])) for each in (True, False))
     return [
         Check(
-            f"felt: solved by a spiral search from where it is seen, on {len(solved[True])} "
-            "scenarios, against pushing straight down",
+            f"felt: solved by a spiral search, of {len(solved[True])}, against pushing",
             f"{by_search:.1f} %",
             f"> {by_pushing:.1f} %",
             by_search > by_pushing,

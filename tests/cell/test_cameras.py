@@ -74,7 +74,7 @@ def miss(env: Environment, name: str, renderer: Renderer) -> float | None:
 
 
 @pytest.mark.parametrize("n", [5, pytest.param(100, marks=pytest.mark.slow)])
-@pytest.mark.each_task
+@pytest.mark.each_task(measures="position_error_mm")
 def test_the_projected_target_lies_where_eye_to_hand_shows_it(
     named: Named, magnify: Callable[[Environment], Renderer], task: str, n: int
 ) -> None:
@@ -89,7 +89,7 @@ def test_the_projected_target_lies_where_eye_to_hand_shows_it(
 
 
 @pytest.mark.parametrize("n", [5, pytest.param(100, marks=pytest.mark.slow)])
-@pytest.mark.each_task
+@pytest.mark.each_task(measures="position_error_mm")
 def test_the_projected_target_lies_where_eye_in_hand_shows_it(
     named: Named, magnify: Callable[[Environment], Renderer], task: str, n: int
 ) -> None:
@@ -148,7 +148,7 @@ def test_the_projected_target_lies_where_it_is_drawn_at_every_moment(
         assert miss(env, "eth", magnify(env)) == misses[-1] or env.info["truncated"]
 
 
-@pytest.mark.each_task
+@pytest.mark.each_task(measures="position_error_mm")
 def test_the_task_s_own_picture_shows_the_target_where_it_is_projected(
     named: Named, task: str
 ) -> None:
@@ -169,7 +169,7 @@ def test_the_task_s_own_picture_shows_the_target_where_it_is_projected(
         assert np.linalg.norm(found.centre - centroid) <= 0.3
 
 
-@pytest.mark.each_task
+@pytest.mark.each_task(measures="position_error_mm")
 def test_the_whole_target_is_in_view_at_the_goal_with_margin(named: Named, task: str) -> None:
     env = named(task)
     for index in range(3):

@@ -73,3 +73,12 @@ def test_mistakes_are_one_line(words, reason, tmp_path, capsys):
     complaint = capsys.readouterr().err
     assert reason in complaint
     assert len(complaint.splitlines()) == 1
+
+
+@pytest.mark.parametrize(("force_n", "cause"), [(39.0, Cause.COLLIDED), (41.0, Cause.OVERLOADED)])
+def test_too_much_force_is_told_from_a_collision(force_n, cause):
+    spec = hvs_suite.TASKS["insert-feel"]
+    errors = {metric.name: 1.0 for metric in spec.metrics} | {"peak_force_n": force_n}
+    ended = {"collision": True, "truncated": False, "errors": errors}
+    lost = row(0, success=False, error=1.0).model_copy(update=ended)
+    assert cause_of(lost, spec, 3, None, [0.1, 0.1]) is cause

@@ -222,3 +222,35 @@ def test_a_search_rules_out_what_a_camera_saw_and_keeps_what_the_arm_hides():
     assert ((hidden[:, :2] @ (eye - at)) < 0).mean() > 0.8
     search.reset()
     assert len(search.possible) == len(everywhere)
+
+
+@pytest.mark.parametrize("task", ["insert-wide", "insert-jig", "insert-feel"])
+def test_with_a_peg_it_sees_the_bushing_and_feels_for_the_hole(task):
+    with hvs_suite.load(task, split=SPLIT) as env:
+        episode = run_episode(env, blind(env), 2)
+        assert episode.success
+        again = run_episode(env, blind(env), 2).actions
+        np.testing.assert_array_equal(again, episode.actions)
+
+
+def test_pushing_straight_down_solves_what_sight_alone_solves():
+    solved = {}
+    for task in ("insert-wide", "insert-feel"):
+        with hvs_suite.load(task, split=SPLIT) as env:
+            policy = Blindfolded(policy_factory("push", task))(env)
+            hidden = [index for index in range(9) if far_off(env, index)][:2]
+            solved[task] = [run_episode(env, policy, index).success for index in hidden or (0, 1)]
+    assert solved == {"insert-wide": [True, True], "insert-feel": [False, False]}
+
+
+def far_off(env, index):
+    """Whether the hole is farther off its paint than the mouth catches a peg."""
+    return np.linalg.norm(env.task.source.draw(index).hole_offset) > 0.0007
+
+
+def test_push_refuses_what_has_no_hole():
+    with (
+        hvs_suite.load("align-easy", split=SPLIT) as env,
+        pytest.raises(PolicyError, match="push does not know tasks of family align"),
+    ):
+        policy_factory("push", "align-easy")(env)

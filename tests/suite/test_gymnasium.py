@@ -296,7 +296,7 @@ def test_a_limit_that_the_environment_would_not_reach_is_refused():
         gymnasium.make("hvs_suite/align-thesis-v1", max_episode_steps=40)
 
 
-@pytest.mark.each_task
+@pytest.mark.each_task(measures="position_error_mm")
 def test_both_checkers_are_content_with_every_goal_environment(task):
     checker = pytest.importorskip("stable_baselines3.common.env_checker")
     with warnings.catch_warnings():

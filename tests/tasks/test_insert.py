@@ -14,7 +14,7 @@ from hvs_suite.errors import OptionError
 from hvs_suite.rollout import run_episode
 from hvs_suite.tasks.insert import DEPTH, PEAK_FORCE, WRENCH
 from hvs_suite.tasks.shared.environment import Environment
-from hvs_suite.tasks.shared.goal import LATERAL
+from hvs_suite.tasks.shared.goal import LATERAL, Tip
 from hvs_suite.tasks.shared.placing import UP
 
 FloatArray = npt.NDArray[np.float64]
@@ -190,8 +190,6 @@ def test_the_wrench_s_noise_depends_on_scenario_and_step_alone() -> None:
 def test_beside_the_bushing_no_depth_counts(env: Environment) -> None:
     env.reset(scenario=0)
     goal = env.goal()
-    from hvs_suite.tasks.shared.goal import Tip
-
     errors = env.task.family.measure(Tip(goal.position + np.array([0.01, 0.0, 0.0]), -UP))
     assert errors[DEPTH] == 0.0
     assert errors[LATERAL] > env.spec.step_bounds[LATERAL]

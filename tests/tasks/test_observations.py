@@ -39,7 +39,7 @@ def test_every_input_combination_of_the_thesis_is_there(observations: str) -> No
 @pytest.mark.each_task
 def test_vision_holds_nothing_privileged_and_state_no_pictures(named: Named, task: str) -> None:
     assert list(named(task).observation_spec()) == [
-        "eih", "eth", "joint_positions", "joint_velocities",
+        "eih", "eth", "joint_positions", "joint_velocities", *named(task).spec.further_observations,
     ]  # fmt: skip
     state = named(task, "state")
     assert set(state.observation_spec()) >= {"goal_position", "joint_positions"}

@@ -52,7 +52,7 @@ def test_options_that_do_not_shape_the_scene_leave_it_alone(task: str) -> None:
         {"observations": "eih", "normalise_observation": True},
         {"eih_resolution": 64, "eth_resolution": 64, "eih_channels": 1, "multisampling": 4},
         {"action_mode": "joint_delta"},
-        {"position_tolerance_mm": 9.0, "tilt_tolerance_deg": 3.0},
+        {"tilt_tolerance_deg": 3.0},
         {"discount": 0.9, "time_limit": "hard"},
         {"eth_position_m": (-1.0, 0.7, 2.5), "eih_fov_deg": 65.0},
         {"target_diameter_m": 0.03},
