@@ -164,7 +164,8 @@ def draw(
         0.62,
         f"to reach: {words.tolerance}"
         + (f", held {words.held}" if words.held else "")
-        + f", within {spec.time_limit_steps} steps of {spec.control_period_s:g} s",
+        + f", within {spec.time_limit_steps} steps of {spec.control_period_s:g} s; "
+        f"shown: test scenario {scenario}",
         size=10,
         color=FAINT,
     )
@@ -173,7 +174,7 @@ def draw(
         edge_in,
         0.84,
         f"start {words.start}; target: {words.target}; "
-        f"disturbed: {'nothing' if varied == '-' else varied}; shown: test scenario {scenario}",
+        f"disturbed: {'nothing' if varied == '-' else varied}",
         size=10,
         color=FAINT,
     )
