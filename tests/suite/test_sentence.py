@@ -122,9 +122,8 @@ def test_sentences_that_were_exchanged_are_damage(recorded: Path, tmp_path: Path
     swapped = [sentences[1], sentences[0], *sentences[2:]]
     column = table.schema.get_field_index("task")
     pq.write_table(table.set_column(column, "task", [swapped]), copy / reader.TASKS)
-    damage = check_dataset(copy).damage
-    assert any("task_index" in each.what for each in damage)
-    assert any(each.file == reader.TASKS for each in damage)
+    # Their order is LeRobot's tools' affair; which of them a frame names is not.
+    assert any("task_index" in each.what for each in check_dataset(copy).damage)
 
 
 def test_a_policy_at_the_other_end_of_a_line_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

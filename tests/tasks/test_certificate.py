@@ -89,12 +89,14 @@ def test_certificates_are_of_the_named_tasks_alone() -> None:
     assert names == {f"{task}.json" for task in hvs_suite.TASKS}
 
 
-@pytest.mark.parametrize("n", [20, pytest.param(TEST_SCENARIOS, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [15, pytest.param(TEST_SCENARIOS, marks=pytest.mark.slow)])
 @pytest.mark.each_task
 def test_the_certificate_holds_when_it_is_computed_anew(task: str, n: int) -> None:
     with hvs_suite.load(task, split="test") as env:
         checks = family_of(task).certify(env, range(n))
-    assert [(check.what, check.found) for check in checks if not check.holds] == []
+    # A share is judged on all scenarios: one of a few is many percent.
+    judged = [c for c in checks if n == TEST_SCENARIOS or not c.found.endswith("%")]
+    assert [(check.what, check.found) for check in judged if not check.holds] == []
     if n == TEST_SCENARIOS:
         stored = certificate.load_certificate(task).checks
         assert [check.what for check in checks] == [check.what for check in stored][: len(checks)]
