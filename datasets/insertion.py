@@ -10,10 +10,10 @@ import dataclasses
 import numpy as np
 import numpy.typing as npt
 
-from hvs_suite.cell.embodiment import Embodiment
 from hvs_suite.cell.kinematics import away_from_stops, kinematics
 from hvs_suite.cell.robot import JOINT_ACCELERATION_RAD_S2, JOINT_RANGE_RAD
 from hvs_suite.datasets.planner import Planner
+from hvs_suite.embodiment import Embodiment
 from hvs_suite.tasks.shared.goal import HEIGHT, LATERAL, TILT, Goal, Tip, goal_errors
 
 FloatArray = npt.NDArray[np.float64]

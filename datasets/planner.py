@@ -24,10 +24,10 @@ import numpy.typing as npt
 import ruckig
 
 from hvs_suite.cell import robot
-from hvs_suite.cell.embodiment import BARE_ARM, Embodiment
 from hvs_suite.cell.kinematics import Kinematics, away_from_stops, kinematics
 from hvs_suite.cell.solid import Solid, obstacle_distance
 from hvs_suite.datasets.roadmap import Roadmap
+from hvs_suite.embodiment import BARE_ARM, Embodiment
 from hvs_suite.tasks.shared.goal import Goal
 
 FloatArray = npt.NDArray[np.float64]

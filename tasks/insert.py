@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from hvs_suite.cell.embodiment import Embodiment, Tool
+from hvs_suite.embodiment import Embodiment, Tool
 from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared.family import Family, Progress, register
 from hvs_suite.tasks.shared.goal import HEIGHT, LATERAL, TILT, Goal, Keypoint, Tip, goal_errors

@@ -7,9 +7,9 @@ from dm_control import composer, mjcf
 
 from hvs_suite.cell import cameras
 from hvs_suite.cell.arm import Iiwa7
-from hvs_suite.cell.embodiment import Embodiment
 from hvs_suite.cell.marker import Marker
 from hvs_suite.cell.surface import Surface
+from hvs_suite.embodiment import Embodiment
 
 
 class Cell(composer.Arena):

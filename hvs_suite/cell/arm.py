@@ -5,9 +5,9 @@ from typing import Any
 from dm_control import composer, mjcf
 
 from hvs_suite.cell import robot
-from hvs_suite.cell.embodiment import BARE_ARM, Embodiment
 from hvs_suite.cell.shells import add_shells
 from hvs_suite.cell.tool import add_tool_shells
+from hvs_suite.embodiment import BARE_ARM, Embodiment
 
 
 class Iiwa7(composer.Entity):

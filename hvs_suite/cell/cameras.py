@@ -17,7 +17,7 @@ from dm_control import mjcf
 from dm_control.composer.observation import observable
 from dm_env import specs
 
-from hvs_suite.cell.embodiment import Embodiment
+from hvs_suite.embodiment import Embodiment
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import pinocchio as pin
 
 from hvs_suite.cell import robot
-from hvs_suite.cell.embodiment import BARE_ARM, Embodiment
+from hvs_suite.embodiment import BARE_ARM, Embodiment
 from hvs_suite.errors import OutputError
 
 FloatArray = npt.NDArray[np.float64]

@@ -25,8 +25,8 @@ import numpy as np
 import numpy.typing as npt
 from dm_control import mjcf
 
-from hvs_suite.cell.embodiment import BARE_ARM, Embodiment
 from hvs_suite.cell.tool import TIP, add_tool
+from hvs_suite.embodiment import BARE_ARM, Embodiment
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import trimesh
 from dm_control import mjcf
 
-from hvs_suite.cell.embodiment import (
+from hvs_suite.embodiment import (
     ADAPTER_LENGTH_M,
     COLLET_LENGTH_M,
     COLLET_RADIUS_M,

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from hvs_suite.cell.embodiment import BARE_ARM, Embodiment
 from hvs_suite.cell.kinematics import away_from_stops, kinematics, travel_time
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
+from hvs_suite.embodiment import BARE_ARM, Embodiment
 from hvs_suite.errors import LockError
 from hvs_suite.files import replacing
 from hvs_suite.tasks.shared.detection import Disc, find_disc

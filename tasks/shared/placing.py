@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 import numpy.typing as npt
 
-from hvs_suite.cell.embodiment import BARE_ARM, Embodiment
+from hvs_suite.embodiment import BARE_ARM, Embodiment
 from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared.family import Family
 from hvs_suite.tasks.shared.goal import (

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
-from hvs_suite.cell.embodiment import BARE_ARM, Embodiment
+from hvs_suite.embodiment import BARE_ARM, Embodiment
 from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared import option_types
 from hvs_suite.tasks.shared.metric import Metric
