@@ -53,6 +53,17 @@ def check(path: Path, result: Result) -> None:
         raise ResultError(f"{path}: {names.shown(summary.policy)!r} is no built-in policy")
 
 
+def is_shipped(path: Path, result: Result) -> bool:
+    """Returns whether a result is one of those that we ship.
+
+    Args:
+        path: ``<policy>/<task>.json``.
+        result: What it holds.
+    """
+    name = f"{path.parent.name}/{result.summary.task}"
+    return shipped().get(name) == result.metadata.actions_sha256
+
+
 def shipped() -> dict[str, str]:
     """Returns the SHA-256 of the action log of each result of ours, by ``<policy>/<task>``."""
     return reading.read_object(FILE, error=ResultError)
