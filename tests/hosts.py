@@ -39,6 +39,14 @@ def reason_against() -> str | None:
     return None
 
 
+ROOT = Path(__file__).parents[1]
+OF_ITS_OWN = """
+mount --bind "$0" /mnt && mount -t tmpfs tmpfs /tmp && mount -t tmpfs tmpfs /dev/shm &&
+mkdir -p "$0" && mount --move /mnt "$0" && exec "$@"
+"""
+"""Gives a command a /tmp of its own, in which the checkout stays where it is, be it below /tmp."""
+
+
 class Hosts:
     """Makes the hosts, and starts Ray on the head, which plays nothing itself.
 
@@ -163,9 +171,7 @@ class Hosts:
         ]
         apart = []
         if name != "head":
-            apart = ["unshare", "--mount", "sh", "-c"]
-            apart += ['mount -t tmpfs tmpfs /tmp && mount -t tmpfs tmpfs /dev/shm && exec "$@"']
-            apart += ["sh"]
+            apart = ["unshare", "--mount", "sh", "-c", OF_ITS_OWN, str(ROOT)]
         self._running[name] = subprocess.Popen(
             self.command(name, [*apart, *words]),
             env=self._environment,
