@@ -15,8 +15,7 @@ from hvs_suite.errors import OptionError
 from hvs_suite.rollout import run_episode
 from hvs_suite.tasks.insert import DEPTH, PEAK_FORCE, WRENCH
 from hvs_suite.tasks.shared.environment import Environment
-from hvs_suite.tasks.shared.goal import LATERAL, Tip
-from hvs_suite.tasks.shared.placing import UP
+from hvs_suite.tasks.shared.goal import LATERAL, UP, Tip
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -179,7 +178,7 @@ def test_the_hidden_error_is_in_no_observation_and_not_in_the_pictures() -> None
         assert 0.00035 < np.std(everywhere) < 0.0005
     with hvs_suite.load("insert-feel", split="test", force_limit_n=39.0) as env:
         other = env.reset(scenario=3)
-        hole = env.task.family._mocaps[1]
+        hole = env.task.family._peg._mocaps[1]
         env.physics.data.mocap_pos[hole] += [0.0005, -0.0005, 0.0]
         [moved] = env.pictures([env.moment()])["eih"]
         np.testing.assert_array_equal(moved, other.observation["eih"])
