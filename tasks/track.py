@@ -16,11 +16,11 @@ import numpy.typing as npt
 
 from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared.family import Progress, register
-from hvs_suite.tasks.shared.goal import POSITION, TILT, Goal
+from hvs_suite.tasks.shared.goal import POSITION, TILT, UP, Goal
 from hvs_suite.tasks.shared.metric import Metric
 from hvs_suite.tasks.shared.motion import Motion, draw_curve, draw_line
-from hvs_suite.tasks.shared.placing import HARD, UP, Placing, PlacingSpec
-from hvs_suite.tasks.shared.scenario import Scenario, Streams, draw_look
+from hvs_suite.tasks.shared.placing import HARD, Placing, PlacingSpec
+from hvs_suite.tasks.shared.scenario import Scenario, Streams
 from hvs_suite.tasks.shared.spec import Description, scene
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ class TrackSpec(PlacingSpec):
             OptionError: One of them does not.
         """
         super().__post_init__()
-        self._check("must be positive", lambda value: value > 0, "acceleration_m_s2", "motion_s")
+        self._check_positive("acceleration_m_s2", "motion_s")
         if not 0.0 < self.speed_m_s[0] <= self.speed_m_s[1]:
             raise OptionError(f"speed_m_s is {self.speed_m_s}; use a least and a larger speed")
         if self.position_tolerance_mm is None:
@@ -148,16 +148,9 @@ class Track(Placing[TrackSpec, TrackScenario]):
 
     def draw(self, streams: Streams) -> TrackScenario:
         """Draw motion, start and look."""
-        from hvs_suite.tasks.shared.start import draw_start
-
         motion = self._draw_motion(streams)
         first = self.goal_over(*motion.place(0.0))
-        own = self.named.start if self.named is not None else "zero"
-        return TrackScenario(
-            motion=motion,
-            start=draw_start(self.spec, own, streams, first, first.normal),
-            **draw_look(self.spec, streams),
-        )
+        return TrackScenario(motion=motion, **self.draw_common(streams, first))
 
     def _draw_motion(self, streams: Streams) -> Motion:
         """Draw motions until one stays on the ring for the whole episode."""
