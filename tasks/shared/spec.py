@@ -8,6 +8,7 @@ means needs a new ``version``; ``tasks/lock.json`` holds the digests.
 
 import dataclasses
 import difflib
+import functools
 import math
 import typing
 from collections.abc import Iterable, Mapping
@@ -345,8 +346,8 @@ class Spec(Timing, Cameras, Disturbances):
         deciding = [m for m in bounded if m.over == "episode" and not m.is_limit] or bounded
         return {metric.name: metric.bound for metric in deciding if metric.bound is not None}
 
-    @property
-    def step_bounds(self) -> dict[str, float]:
+    @functools.cached_property
+    def step_bounds(self) -> Mapping[str, float]:
         """Bounds on the step metrics: a control step that ends inside all of them is held."""
         return {
             metric.name: metric.bound
