@@ -148,14 +148,25 @@ def refuse_test_split(manifest: Manifest) -> None:
         )
 
 
-def read_columns(manifest: Manifest) -> dict[str, Column]:
-    """Read the columns that training uses: state, actions, targets, goal, episode.
+def read_columns(manifest: Manifest, wanted: Collection[str] | None = None) -> dict[str, Column]:
+    """Read columns of numbers.
+
+    Args:
+        manifest: Of the dataset.
+        wanted: Their keys; by default those that training uses: state, actions, targets, goal.
 
     Returns:
         Key to (n_frames, k) float32; ``episode_index`` to (n_frames,) int64.
+
+    Raises:
+        DatasetError: They are not there, or damaged.
     """
-    keys = [key for key in manifest.trained_keys if not key.startswith(IMAGE_PREFIX)]
-    if ACTION not in keys or not manifest.cameras:
+    keys = [
+        key
+        for key in (manifest.trained_keys if wanted is None else wanted)
+        if not key.startswith(IMAGE_PREFIX)
+    ]
+    if wanted is None and (ACTION not in keys or not manifest.cameras):
         raise DatasetError(f"{manifest.root} needs an action and at least one camera to learn from")
     parts: dict[str, list[Column]] = {key: [] for key in [*keys, EPISODE]}
     for path in reader.data_files(manifest.root):
