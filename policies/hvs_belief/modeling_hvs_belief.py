@@ -80,7 +80,8 @@ class HvsBeliefPolicy(PreTrainedPolicy):
         self._recorded = recorded(columns, cameras, self.config.control_period_s)
         if with_prior:
             q = torch.from_numpy(columns[OBS_STATE][:, :N_JOINTS]).double()
-            prior = fit_prior(columns, self.network.views(flange_motion(q)))
+            views = self.network.views(flange_motion(q))
+            prior = fit_prior(columns, views, self.config.control_period_s)
             self.network.belief.set_prior(prior)
 
     def get_optim_params(self) -> Any:
