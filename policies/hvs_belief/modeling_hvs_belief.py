@@ -113,7 +113,8 @@ class HvsBeliefPolicy(PreTrainedPolicy):
         state = torch.where(real[:, :, None], batch[OBS_STATE], batch[OBS_STATE][:, -1:])
         truth = self._truth(batch, real)
         goal, felt = (
-            _of(batch, key, real) for key in (self.config.goal_key, self.config.wrench_key)
+            None if key is None else batch[key][real].float()
+            for key in (self.config.goal_key, self.config.wrench_key)
         )
         images = {name: batch[IMAGE_PREFIX + name][real] for name in network.shape.cameras}
         sightings = network.look(images, goal)
@@ -202,13 +203,18 @@ class HvsBeliefPolicy(PreTrainedPolicy):
         if self._memory is None or len(self._memory) != len(state):
             # A new episode, or other environments than before.
             self._memory = self.network.start(len(state))
+        # LeRobot's pre-processor makes batches of one of states and images alone.
+        goal, felt = (
+            None if key is None else batch[key].float().reshape(len(state), -1)
+            for key in (self.config.goal_key, self.config.wrench_key)
+        )
         action, self._memory = act(
             self.network,
             {name: batch[IMAGE_PREFIX + name] for name in self.network.shape.cameras},
             state,
             self._memory,
-            _of(batch, self.config.goal_key),
-            _of(batch, self.config.wrench_key),
+            goal,
+            felt,
         )
         return action[:, None]
 
@@ -252,13 +258,6 @@ def _real(batch: dict[str, Tensor]) -> Tensor:
         return ~batch[PADDED]
     state = batch[OBS_STATE]
     return torch.ones(state.shape[:2], dtype=torch.bool, device=state.device)
-
-
-def _of(batch: dict[str, Tensor], key: str | None, frames: Tensor | None = None) -> Tensor | None:
-    """An input that a policy may have, of some frames of it."""
-    if key is None:
-        return None
-    return batch[key].float() if frames is None else batch[key][frames].float()
 
 
 def save_checkpoint(policy: HvsBeliefPolicy, folder: Path) -> None:
