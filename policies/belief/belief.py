@@ -1,7 +1,7 @@
 """The belief: what the robot thinks the goal is, as a Kalman filter with learned noises.
 
-The state is the target's place and velocity, Gaussian with a full covariance, and the slope of the
-surface there. Where targets lie is a prior that comes from the demonstrations: targets that all lie
+The state is the target's place, velocity and acceleration, Gaussian with a full covariance, and the
+slope of the surface there. Where targets lie is a prior that comes from the demonstrations: targets that all lie
 on one level have a flat one, and a ray meets it as it would meet a plane. A sighting is a ray, on
 which the target's size says how far away it is. How far to trust each of them, how much a target
 may have moved, and when to forget it because it is suddenly elsewhere, a small network decides from
@@ -27,25 +27,29 @@ from hvs_suite.policies.belief.eye import (
 )
 from hvs_suite.policies.network.geometry import FlangeMotion
 
-BELIEF_SIZE = 3 + 3 + 36 + 2 + 1
-"""Place (m), velocity (m/s), their covariance, slope, and its variance."""
-PLACE, VELOCITY, COVARIANCE, TILT, TILT_VARIANCE = (
+N_MOTION = 9
+"""Numbers of the state that move: place (m), velocity (m/s) and acceleration (m/s2)."""
+BELIEF_SIZE = N_MOTION + N_MOTION**2 + 2 + 1
+PLACE, VELOCITY, ACCELERATION, MOTION, COVARIANCE, TILT, TILT_VARIANCE = (
     slice(0, 3),
     slice(3, 6),
-    slice(6, 42),
-    slice(42, 44),
-    slice(44, 45),
+    slice(6, 9),
+    slice(0, N_MOTION),
+    slice(N_MOTION, BELIEF_SIZE - 3),
+    slice(BELIEF_SIZE - 3, BELIEF_SIZE - 1),
+    slice(BELIEF_SIZE - 1, BELIEF_SIZE),
 )
+"""Where these, the covariance of the first three, and the slope and its variance stand."""
 MAX_DEPTH_M = 3.5
 MIN_DEPTH_M = 0.02
 GATES_A_CAMERA = 4
 GATES = 4
-"""Of all cameras: forgetting, and how much place, velocity and slope may have changed."""
+"""Of all cameras: forgetting, and how much place, motion and slope may have changed."""
 FORGET_SLOPE = 5.0
 FORGET_AT = 3.2
 """A share of 1e-7 is forgotten where the gate says 0: of half a metre, a tenth of a millimetre."""
 FEATURES_A_CAMERA = 9
-FEATURES = 9
+FEATURES = 12
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -54,7 +58,7 @@ class Prior:
 
     Attributes:
         place: Mean, (3,) m.
-        covariance: Of place and velocity, (6, 6).
+        covariance: Of place, velocity and acceleration, (9, 9).
         slope: Mean of the normal's x and y over its z, (2,).
         slope_variance: Of each.
         standoff_m: From the target along its normal to the goal of the tip (m).
@@ -105,14 +109,16 @@ class Belief(nn.Module):
         n = len(cameras)
         start = torch.zeros(BELIEF_SIZE, dtype=torch.float64)
         start[COVARIANCE] = torch.diag(
-            torch.tensor([0.25] * 3 + [1e-8] * 3, dtype=torch.float64)
+            torch.tensor([0.25] * 3 + [1e-8] * 6, dtype=torch.float64)
         ).flatten()
         start[TILT_VARIANCE] = 1e-4
         self.register_buffer("prior", start)
         self.register_buffer("standoff", torch.tensor(0.05, dtype=torch.float64))
         self.register_buffer("sizes", torch.full((n,), 0.02, dtype=torch.float64))
-        transition = torch.eye(6, dtype=torch.float64)
-        transition[:3, 3:] = period_s * torch.eye(3, dtype=torch.float64)
+        eye3 = torch.eye(3, dtype=torch.float64)
+        transition = torch.eye(N_MOTION, dtype=torch.float64)
+        transition[PLACE, VELOCITY] = transition[VELOCITY, ACCELERATION] = period_s * eye3
+        transition[PLACE, ACCELERATION] = 0.5 * period_s**2 * eye3
         self.register_buffer("transition", transition, persistent=False)
         # Floors of what cameras tell: angle (rad), place (m), share of a distance, slope.
         floors = torch.tensor([2e-3, 5e-4, 0.01, 0.01]).log().repeat(n, 1)
@@ -127,7 +133,7 @@ class Belief(nn.Module):
     def set_prior(self, prior: Prior) -> None:
         """Copy a prior into the buffers that are saved with the weights."""
         self.prior[PLACE] = prior.place
-        self.prior[VELOCITY] = 0.0
+        self.prior[3:N_MOTION] = 0.0
         self.prior[COVARIANCE] = prior.covariance.flatten()
         self.prior[TILT] = prior.slope
         self.prior[TILT_VARIANCE] = prior.slope_variance
@@ -136,7 +142,7 @@ class Belief(nn.Module):
             self.sizes[i] = prior.sizes[name]
 
     def start(self, n: int) -> Tensor:
-        """What is believed before anything is seen, (n, 45) float64."""
+        """What is believed before anything is seen, (n, k) float64."""
         return self.prior.expand(n, BELIEF_SIZE).clone()
 
     def forward(
@@ -145,18 +151,18 @@ class Belief(nn.Module):
         """One control step: what was believed goes on, and what is seen is taken in.
 
         Args:
-            belief: (B, 45) float64.
+            belief: (B, k) float64.
             sightings: Camera name to (B, 9) of its eye.
             views: Camera name to its pose.
 
         Returns:
-            What is believed now, (B, 45), and the gates in (0, 1) that say how much was forgotten,
+            What is believed now, (B, k), and the gates in (0, 1) that say how much was forgotten,
             (B, 1).
         """
         n = len(belief)
         F = self.transition
-        x = belief[:, :6] @ F.T
-        P = F @ belief[:, COVARIANCE].view(n, 6, 6) @ F.T
+        x = belief[:, MOTION] @ F.T
+        P = F @ belief[:, COVARIANCE].view(n, N_MOTION, N_MOTION) @ F.T
         slope, slope_var = belief[:, TILT], belief[:, TILT_VARIANCE]
         looks = [self._look(i, x, P, sightings[c], views[c]) for i, c in enumerate(self.cameras)]
         features = [look.features for look in looks]
@@ -169,13 +175,14 @@ class Belief(nn.Module):
         forget = torch.sigmoid(FORGET_SLOPE * (common[:, :1] - FORGET_AT))
         keep = 1.0 - forget
         start = self.prior
-        prior_P = start[COVARIANCE].view(6, 6)
-        x = keep * x + forget * torch.cat([start[PLACE], start[VELOCITY]])
+        prior_P = start[COVARIANCE].view(N_MOTION, N_MOTION)
+        x = keep * x + forget * start[MOTION]
         P = keep[:, :, None] * P + forget[:, :, None] * prior_P
         prior_variance = torch.diagonal(prior_P)
         change = torch.exp(common[:, 1:].clamp(-6.0, 6.0))
         q = torch.cat(
-            [1e-10 * change[:, :1].expand(n, 3), prior_variance[3:] * 1e-3 * change[:, 1:2]], dim=1
+            [1e-10 * change[:, :1].expand(n, 3), prior_variance[3:] * 1e-3 * change[:, 1:2]],
+            dim=1,
         )
         P = P + torch.diag_embed(q)
         slope = keep * slope + forget * start[TILT]
@@ -190,10 +197,10 @@ class Belief(nn.Module):
             vector = vector + (Lambda @ (point - x[:, :3])[:, :, None])[:, :, 0]
         eye3 = torch.eye(3, dtype=P.dtype)
         middle = torch.linalg.inv(eye3 + info @ P[:, :3, :3])  # (I + L P)^-1
-        gain = P[:, :, :3] @ middle  # (B, 6, 3), acts on information
+        gain = P[:, :, :3] @ middle  # (B, 9, 3), acts on information
         x = x + (gain @ vector[:, :, None])[:, :, 0]
         P = P - gain @ info @ P[:, :3, :]
-        P = 0.5 * (P + P.transpose(1, 2)) + 1e-13 * torch.eye(6, dtype=P.dtype)
+        P = 0.5 * (P + P.transpose(1, 2)) + 1e-13 * torch.eye(N_MOTION, dtype=P.dtype)
         for i, look in enumerate(looks):
             gate = gates[:, GATES_A_CAMERA * i : GATES_A_CAMERA * (i + 1)]
             seen, variance = self._facing(i, look, gate)
@@ -301,7 +308,7 @@ def belief_loss(
     """How likely the truth is by what is believed, and how far off its mean is.
 
     Args:
-        belief: (n, 45).
+        belief: (n, k).
         place: (n, 3) m.
         velocity: (n, 3) m/s.
         slope: (n, 2).
@@ -312,7 +319,7 @@ def belief_loss(
     """
     n = len(belief)
     off = torch.cat([place - belief[:, PLACE], velocity - belief[:, VELOCITY]], dim=1).double()
-    P = belief[:, COVARIANCE].view(n, 6, 6)[:, :3, :3]
+    P = belief[:, COVARIANCE].view(n, N_MOTION, N_MOTION)[:, :3, :3]
     e = off[:, :3]
     squared = (e * (torch.linalg.inv(P) @ e[:, :, None])[:, :, 0]).sum(dim=1)
     place_nll = 0.5 * torch.logdet(P) + 3.5 * torch.log1p(squared / 4.0)

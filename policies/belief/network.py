@@ -22,8 +22,10 @@ from torch import Tensor, nn
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
 from hvs_suite.policies.belief import arm
 from hvs_suite.policies.belief.belief import (
+    ACCELERATION,
     BELIEF_SIZE,
     COVARIANCE,
+    N_MOTION,
     PLACE,
     TILT_VARIANCE,
     VELOCITY,
@@ -119,7 +121,7 @@ class BeliefNetwork(nn.Module):
         hidden = shape.hidden
         width = 3 * N_JOINTS + N_JOINTS + N_JOINTS  # q, velocity, pending
         width += 4 * n + RECENT_SIZE  # sightings
-        width += 3 + 3 + 1 + 3 + 2  # stds of place, of velocity, of slope; velocity; slope
+        width += N_MOTION + 1 + 3 + 3 + 2  # deviations; velocity, acceleration, slope
         width += 2 * 8  # arm and set point in the goal's frame
         width += shape.n_felt * 2
         self.width = width
@@ -250,7 +252,8 @@ class BeliefNetwork(nn.Module):
         standoff = self.belief.standoff.float()
         place, speed = believed[:, PLACE].float(), believed[:, VELOCITY].float()
         goal = place + standoff * normal
-        P = believed[:, COVARIANCE].view(-1, 6, 6)
+        bend = believed[:, ACCELERATION].float()
+        P = believed[:, COVARIANCE].view(-1, N_MOTION, N_MOTION)
         stds = torch.diagonal(P, dim1=1, dim2=2).clamp(min=1e-14).sqrt().float()
         tilt_std = believed[:, TILT_VARIANCE].sqrt().float()
         features = [torch.sin(q), torch.cos(q), q / self.joint_range, velocity / self.joint_speed]
@@ -259,7 +262,7 @@ class BeliefNetwork(nn.Module):
             features += [torch.tanh(s[:, VISIBLE] / 4.0), s[:, UV].clamp(-2, 2)]
             features.append(0.3 * s[:, LOG_DIAMETER])
         features.append(memory[:, RECENT].float())
-        features += [0.3 * torch.log(stds), 0.3 * torch.log(tilt_std), 10.0 * speed]
+        features += [0.3 * torch.log(stds), 0.3 * torch.log(tilt_std), 10.0 * speed, 5.0 * bend]
         features.append(normal[:, :2])
         for tip in (here, sent):
             features.append(self._in_goal_frame(tip, goal, normal))
@@ -273,7 +276,7 @@ class BeliefNetwork(nn.Module):
         side = sent.rotation[:, :, :2]
         side = side - normal[:, :, None] * (normal[:, None] @ side)
         lead = self.lead_s * (1.0 + 0.5 * torch.tanh(guided[:, 3:]))
-        ahead = goal + lead * speed
+        ahead = goal + lead * speed + 0.5 * lead**2 * bend
         waypoint = ahead + (side @ by[:, :2, None])[:, :, 0] + by[:, 2:] * normal
         proposals = [arm.joint_step(sent, waypoint - sent.position, normal)]
         ways = []

@@ -117,10 +117,13 @@ def fit_prior(d, net):
         sizes[n] = float((t[ok, 2] * depth[ok]).median()) if ok.any() else 0.02
     vel = torch.from_numpy(c["privileged.goal_velocity"]).double()
     mean = place.mean(0)
-    cov = torch.zeros(6, 6, dtype=torch.float64)
+    cov = torch.zeros(9, 9, dtype=torch.float64)
+    ep = torch.from_numpy(c[EPISODE]); same = ep[1:] == ep[:-1]
+    acc = (vel[1:] - vel[:-1])[same] / net.cell.period_s
+    cov[6:, 6:] = torch.diag(1.5 * acc.square().mean(0)) + torch.eye(3) * 1e-5 ** 2
     x = place - mean
     cov[:3, :3] = 1.5 * x.T @ x / len(x) + torch.eye(3) * (2e-5) ** 2
-    cov[3:, 3:] = 1.5 * vel.T @ vel / len(vel) + torch.eye(3) * 1e-5 ** 2
+    cov[3:6, 3:6] = 1.5 * vel.T @ vel / len(vel) + torch.eye(3) * 1e-5 ** 2
     sl = nrm[:, :2] / nrm[:, 2:]
     pr = Prior(mean, cov, sl.mean(0), float(1.5 * sl.var() + 1e-7), s, sizes)
     print("prior", mean, cov.diagonal().sqrt(), pr.slope_variance ** .5, s, sizes, flush=True)

@@ -7,6 +7,7 @@ import torch
 from hvs_suite.policies.belief.belief import (
     BELIEF_SIZE,
     COVARIANCE,
+    N_MOTION,
     PLACE,
     TILT,
     TILT_VARIANCE,
@@ -29,8 +30,8 @@ from hvs_suite.policies.belief.eye import (
 PERIOD_S = 0.1
 SIZE = 0.036  # of a 50 mm disc at 70 deg, in image widths at a metre
 TAN = 0.7
-FLAT = torch.tensor([0.09, 0.09, 1e-10, 1e-10, 1e-10, 1e-10], dtype=torch.float64)
-DEEP = torch.tensor([0.09, 0.09, 0.01, 0.01, 0.01, 1e-10], dtype=torch.float64)
+FLAT = torch.tensor([0.09, 0.09, *[1e-10] * 7], dtype=torch.float64)
+DEEP = torch.tensor([0.09, 0.09, 0.01, *[0.01] * 2, 1e-10, *[0.001] * 2, 1e-10], dtype=torch.float64)
 
 
 def make_belief(variances: torch.Tensor = FLAT) -> Belief:
@@ -91,7 +92,7 @@ def test_a_ray_meets_a_flat_prior_as_it_would_meet_a_plane() -> None:
     # The size is of no use: the prior's height alone says how far away the target is.
     now = after(make_belief(), [view], [target], sigma_size=3.0)
     np.testing.assert_allclose(now[0, PLACE], target, atol=2e-3)
-    assert now[0, COVARIANCE].view(6, 6)[0, 0].sqrt() < 0.01
+    assert now[0, COVARIANCE].view(N_MOTION, N_MOTION)[0, 0].sqrt() < 0.01
 
 
 def test_a_size_says_how_high_a_target_lies_where_the_prior_does_not() -> None:
@@ -115,7 +116,7 @@ def test_more_looks_are_surer_and_a_sure_eye_counts_for_more() -> None:
 
     def spread(n: int, sigma: float) -> float:
         now = after(make_belief(), [view] * n, [target] * n, sigma_uv=sigma)
-        return float(now[0, COVARIANCE].view(6, 6)[0, 0].sqrt())
+        return float(now[0, COVARIANCE].view(N_MOTION, N_MOTION)[0, 0].sqrt())
 
     assert spread(5, 0.02) < 0.7 * spread(1, 0.02)
     assert spread(1, 0.005) < 0.7 * spread(1, 0.02)
@@ -139,7 +140,7 @@ def test_the_covariance_stays_one_over_a_long_episode() -> None:
             view = from_above((*(height * random.uniform(-0.4, 0.4, 2)), height))
             sighting = seen(view, (0.01, 0.02, 0.0), visible=float(random.choice([-12.0, 12.0])))
             now, _ = belief(now, {"eih": sighting}, {"eih": view})
-    P = now[0, COVARIANCE].view(6, 6)
+    P = now[0, COVARIANCE].view(N_MOTION, N_MOTION)
     assert torch.isfinite(now).all()
     np.testing.assert_allclose(P, P.T)
     assert torch.linalg.eigvalsh(P).min() > 0.0
@@ -149,7 +150,7 @@ def test_the_covariance_stays_one_over_a_long_episode() -> None:
 @pytest.mark.parametrize("off", [PLACE, TILT])
 def test_the_loss_grows_with_the_error_and_asks_for_honest_doubts(off: slice) -> None:
     belief = torch.zeros(1, BELIEF_SIZE, dtype=torch.float64)
-    belief[:, COVARIANCE] = torch.eye(6, dtype=torch.float64).flatten() * 1e-6
+    belief[:, COVARIANCE] = torch.eye(N_MOTION, dtype=torch.float64).flatten() * 1e-6
     belief[:, TILT_VARIANCE] = 1e-4
     zero, flat = torch.zeros(1, 3, dtype=torch.float64), torch.zeros(1, 2, dtype=torch.float64)
 

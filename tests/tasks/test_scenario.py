@@ -14,10 +14,10 @@ from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.cell.robot import JOINT_RANGE_RAD
 from hvs_suite.cell.surface import Surface
 from hvs_suite.errors import OptionError, ScenarioError
-from hvs_suite.registry import make_task
+from hvs_suite.registry import find, make_task
 from hvs_suite.tasks.align import fixed_places
 from hvs_suite.tasks.shared.environment import Environment
-from hvs_suite.tasks.shared.scenario import ScenarioSource
+from hvs_suite.tasks.shared.scenario import ScenarioSource, StepStream
 from hvs_suite.tasks.shared.start import steps_lower_bound
 
 Named = Callable[..., Environment]
@@ -43,6 +43,14 @@ def test_a_scenario_depends_on_its_index_and_on_no_other_draw(task: str) -> None
     assert digests(forward, [37]) == [expected[3]]
 
 
+def test_a_stream_that_is_set_to_a_step_draws_as_one_made_for_it() -> None:
+    draws = source("align-hard")
+    stream = StepStream(draws, "noise-eth")
+    for index, step in ((3, 0), (3, 7), (0, 7), (999, 39), (3, 7)):
+        expected = draws.generator("noise-eth", index, step).integers(1000, size=5)
+        np.testing.assert_array_equal(stream.at(index, step).integers(1000, size=5), expected)
+
+
 @pytest.mark.each_task
 def test_options_that_do_not_shape_the_scene_leave_it_alone(task: str) -> None:
     expected = digests(source(task), [0, 5])
@@ -55,7 +63,7 @@ def test_options_that_do_not_shape_the_scene_leave_it_alone(task: str) -> None:
         {"tilt_tolerance_deg": 3.0},
         {"discount": 0.9, "time_limit": "hard"},
         {"eth_position_m": (-1.0, 0.7, 2.5), "eih_fov_deg": 65.0},
-        {"target_diameter_m": 0.03},
+        {"target_diameter_m": 0.9 * find(task).target_diameter_m},
         {"acceleration_limits": True},
     ):
         assert digests(source(task, **options), [0, 5]) == expected, options
@@ -327,6 +335,13 @@ def test_starts_near_the_goal_are_near_and_clear(start: str, surface: str) -> No
     else:
         upright = np.array([not draws.draw(i).start.any() for i in range(n)])
         assert 0.25 < upright.mean() < 0.75
+
+
+def test_a_panel_that_leans_towards_the_arm_has_starts_near_the_goal() -> None:
+    draws = source("surface-fuselage", "train", start="mixed")
+    scene = draws.draw(459)  # its plane, were it endless, would cut the shoulder
+    goal = scene.target + 0.05 * scene.normal
+    assert np.linalg.norm(kinematics().flange_pose(scene.start)[1] - goal) < 0.30
 
 
 @pytest.mark.parametrize("surface", ["tilted", "curved"])
