@@ -2,8 +2,6 @@
 
 import json
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,11 +12,16 @@ import torch
 from hvs_suite.datasets.features import dataset_features
 from hvs_suite.errors import PolicyError
 from hvs_suite.policies.belief.acting import CompiledBelief, act
+from hvs_suite.policies.belief.belief import COVARIANCE, N_MOTION
 from hvs_suite.policies.belief.cell_model import cell_model
+from hvs_suite.policies.belief.eye import SIGHTING_SIZE
+from hvs_suite.policies.belief.network import SET_POINT
+from hvs_suite.policies.belief.recorded import set_points
 from hvs_suite.policies.belief.settings import as_numbers
 from hvs_suite.policies.catalogue import policy_factory
 from hvs_suite.policies.checkpoints.files import read_config
 from hvs_suite.policies.checkpoints.loading import CheckpointPolicy, load_belief_network
+from hvs_suite.policies.network.dataset import read_columns, read_manifest
 from hvs_suite.policies.trained_for import trained_for
 from hvs_suite.registry import TASKS
 
@@ -27,7 +30,7 @@ SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "align-thesis"
 PLAYED = ("align-easy", "clutter-choice", "insert-wide")
 WINDOW = 5
 ENDS = (1, 11, 22)
-"""Of the windows of the batch: the second frame of an episode, and where the hand sees the target."""
+"""Of the windows of the batch: the second frame of an episode, and two that show the target."""
 
 
 def new_policy(task: str):
@@ -113,16 +116,6 @@ def one(spec, observation: dict, n: int = 1) -> dict[str, torch.Tensor]:
 
 
 # --- as LeRobot keeps it ---
-
-
-def test_importing_the_package_registers_the_type():
-    ask = (
-        "import hvs_suite.policies.hvs_belief\n"
-        "from lerobot.configs import PreTrainedConfig\n"
-        "print(PreTrainedConfig.get_choice_class('hvs_belief').__name__)"
-    )
-    done = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, check=True)
-    assert done.stdout == "HvsBeliefConfig\n"
 
 
 def test_a_saved_policy_is_the_same_policy(played):
@@ -249,7 +242,8 @@ def test_a_new_policy_takes_task_cell_and_prior_from_its_dataset(learner):
         atol=0.0,
     )
     # All targets lie on one level: the prior is as flat.
-    assert belief.start(1)[0, 6 + 2 * 7].sqrt() < 1e-3 < belief.start(1)[0, 6].sqrt()
+    variance = belief.start(1)[0, COVARIANCE].view(N_MOTION, N_MOTION).diagonal()
+    assert variance[2].sqrt() < 1e-3 < variance[0].sqrt()
 
 
 def test_a_batch_of_windows_trains_eyes_belief_and_head(learner, batch):
@@ -257,7 +251,7 @@ def test_a_batch_of_windows_trains_eyes_belief_and_head(learner, batch):
     losses = []
     for _ in range(8):
         loss, parts = learner.forward(batch)
-        assert set(parts) == {"action_loss", "tip_loss", "belief_loss", "eih_loss", "eth_loss"}
+        assert {"action_loss", "tip_loss", "eih_loss", "eth_loss"} < set(parts)
         optimizer.zero_grad()
         loss.backward()
         losses.append(loss.item())
@@ -279,7 +273,7 @@ def test_the_memory_goes_through_the_window(learner, batch):
         for key, value in batch.items()
     }
     _, alone = learner.forward(forgetful)
-    assert alone["belief_loss"] != pytest.approx(parts["belief_loss"], rel=1e-3)
+    assert alone["belief_place_loss"] != pytest.approx(parts["belief_place_loss"], rel=1e-3)
 
 
 def test_frames_before_the_beginning_do_not_matter(learner, batch):
@@ -307,28 +301,25 @@ def test_the_truth_of_a_window_is_that_of_its_frames(learner, batch, dataset):
     assert learner.forward(public)[1] == right
 
 
-def test_the_set_point_in_training_is_the_one_in_playing(learner, dataset):
-    """Playing what was recorded, the policy would remember what training gives it."""
-    from hvs_suite.policies.belief.network import SET_POINT
-
-    rows = dataset.hf_dataset.with_format("torch")
+def test_the_set_point_in_training_is_the_one_in_playing(learner):
+    """Playing what was recorded, the policy remembers what training gives it."""
+    columns = read_columns(read_manifest(SAMPLE))
+    told = set_points(columns, learner.network.cell.period_s)
+    state, executed = (
+        torch.from_numpy(columns[key])
+        for key in ("observation.state", "privileged.action_executed")
+    )
     memory = learner.network.start(1)
-    nothing = {name: torch.zeros(1, 9) for name in learner.network.shape.cameras}
+    nothing = {name: torch.zeros(1, SIGHTING_SIZE) for name in learner.network.shape.cameras}
     for k in range(8):
-        q = rows[k]["observation.state"][None, :7]
-        memory = learner.network.remember(memory, nothing, q)
-        told = learner._recorded.set_point[k : k + 1]
-        torch.testing.assert_close(memory[:, SET_POINT].float(), told, atol=1e-5, rtol=0)
-        memory = learner.network.commanded(memory, rows[k]["privileged.action_executed"][None])
+        memory = learner.network.remember(memory, nothing, state[k : k + 1, :7])
+        np.testing.assert_allclose(memory[0, SET_POINT].detach(), told[k], atol=1e-5)
+        memory = learner.network.commanded(memory, executed[k : k + 1])
 
 
-def test_without_the_truth_a_policy_learns_from_actions_alone_and_says_so(learner, batch, caplog):
-    strange = {key: value for key, value in batch.items() if key != "index"}
-    loss, parts = learner.forward(strange)
-    loss.backward()
-    assert set(parts) == {"action_loss"}
-    assert "actions alone" in caplog.text
-    assert learner.network.eyes["eih"].features[0].weight.grad.abs().max() > 0.0
+def test_a_policy_without_a_dataset_does_not_train(batch):
+    with pytest.raises(ValueError, match="dataset_meta"):
+        new_policy("align-easy").forward(batch)
 
 
 def test_lerobots_pipeline_delivers_what_the_loss_needs(learner, batch):
