@@ -1,11 +1,11 @@
 """The belief: what the robot thinks the goal is, as a Kalman filter with learned noises.
 
-The state is the target's place, velocity and acceleration, Gaussian with a full covariance, and the
-slope of the surface there. Where targets lie is a prior that comes from the demonstrations: targets that all lie
-on one level have a flat one, and a ray meets it as it would meet a plane. A sighting is a ray, on
-which the target's size says how far away it is. How far to trust each of them, how much a target
-may have moved, and when to forget it because it is suddenly elsewhere, a small network decides from
-how well what is seen fits what was believed.
+The state is the target's place, velocity and acceleration, Gaussian with a full covariance, and
+the slope of the surface there. Where targets lie is a prior that comes from the demonstrations:
+targets that all lie on one level have a flat one, and a ray meets it as it would meet a plane. A
+sighting is a ray, on which the target's size says how far away it is. How far to trust each of
+them, how much a target may have moved, and when to forget it because it is suddenly elsewhere, a
+small network decides from how well what is seen fits what was believed.
 
 Double precision: variances of a tenth of a millimetre and of half a metre meet in one matrix.
 """
@@ -25,7 +25,6 @@ from hvs_suite.policies.belief.eye import (
     UV,
     VISIBLE,
 )
-from hvs_suite.policies.network.geometry import FlangeMotion
 
 N_MOTION = 9
 """Numbers of the state that move: place (m), velocity (m/s) and acceleration (m/s2)."""

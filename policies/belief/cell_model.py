@@ -1,4 +1,4 @@
-"""What a policy may know of the cell beforehand: its nominal geometry, from the task's parameters."""
+"""What a policy may know of the cell beforehand: its nominal geometry."""
 
 import math
 

@@ -14,7 +14,6 @@ import dataclasses
 import math
 from collections.abc import Mapping
 
-import numpy as np
 import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
@@ -303,7 +302,7 @@ class BeliefNetwork(nn.Module):
         return total
 
     def _in_goal_frame(self, tip: FlangeMotion, goal: Tensor, normal: Tensor) -> Tensor:
-        """Where a tip is by the goal: along the tool's axes and the normal, and how tilted, (B, 8)."""
+        """Where a tip is by the goal, along tool and normal, and how tilted it is, (B, 8)."""
         scale = self.shape.error_scale
         offset = tip.position - goal
         height = (offset * normal).sum(dim=1, keepdim=True)

@@ -40,8 +40,6 @@ class HvsBeliefConfig(PreTrainedConfig):
             `hvs_suite.policies.trained_for` holds them against what is to be played.
         window: Frames of the sequences that stock ``lerobot-train`` trains on, the memory with
             them. Where less of the episode came before, the window is padded.
-        keypoint_weight: Weight of the losses of eyes and belief against where the target truly is,
-            where the dataset has ``privileged.*`` columns; 0 trains on actions alone.
         optimizer_lr: Peak learning rate of stock ``lerobot-train``.
         optimizer_weight_decay: AdamW's weight decay.
     """
@@ -63,7 +61,6 @@ class HvsBeliefConfig(PreTrainedConfig):
     control_period_s: float = CONTROL_PERIOD_S
     options: dict[str, Any] = field(default_factory=dict)
     window: int = 16
-    keypoint_weight: float = 1.0
     optimizer_lr: float = 2e-3
     optimizer_weight_decay: float = 1e-4
 
@@ -72,8 +69,6 @@ class HvsBeliefConfig(PreTrainedConfig):
         super().__post_init__()
         if self.window < 1:
             raise ValueError(f"`window` must be at least 1, got {self.window}.")
-        if self.keypoint_weight < 0:
-            raise ValueError(f"`keypoint_weight` must not be negative, got {self.keypoint_weight}.")
         if self.n_obs_steps != 1:
             raise ValueError(f"The policy reads one observation, got {self.n_obs_steps=}.")
 

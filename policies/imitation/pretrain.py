@@ -277,7 +277,7 @@ class _Run:
                 step = self._counters.step
                 if teacher.is_due(share):
                     self._checkpoint(teacher, optimizer, state, curves)
-                    teacher.look_again(step, share)
+                    teacher.look_again(share)
                 step_rate = rate * _schedule(share)
                 for group in optimizer.param_groups:
                     group["lr"] = step_rate

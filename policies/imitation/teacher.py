@@ -43,7 +43,7 @@ class Teacher(Protocol):
     def is_due(self, share: float) -> bool:
         """Whether `look_again` is to be called at this part of the training, 0 to 1."""
 
-    def look_again(self, step: int, share: float) -> None:
+    def look_again(self, share: float) -> None:
         """Do what is too dear for every step; what it makes is a function of the weights."""
 
     def lesson(self, rows: np.ndarray, step: int) -> tuple[Tensor, Parts]:
@@ -85,7 +85,7 @@ class FrameTeacher:
         """Never."""
         return False
 
-    def look_again(self, step: int, share: float) -> None:
+    def look_again(self, share: float) -> None:
         """Nothing."""
 
     def lesson(self, rows: np.ndarray, step: int) -> tuple[Tensor, Parts]:

@@ -12,10 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from hvs_suite.errors import DatasetError
 from hvs_suite.policies.belief.lessons import eye_lesson, window_lesson
 from hvs_suite.policies.belief.network import N_JOINTS
 from hvs_suite.policies.belief.prior import fit_prior
-from hvs_suite.policies.belief.recorded import recorded
+from hvs_suite.policies.belief.recorded import recorded, recorded_keys
 from hvs_suite.policies.imitation.demonstrations import Demonstrations
 from hvs_suite.policies.imitation.settings import Settings
 from hvs_suite.policies.imitation.teacher import HELD_OUT_BATCH, HELD_OUT_FRAMES, Parts
@@ -79,13 +80,11 @@ class WindowTeacher:
     def _reopen(self, share: float) -> None:
         """Go on with what a killed run saw last, if it has gone so far."""
         self._opened = True
-        if (
-            share >= FIRST_LOOK
-            and self._windows.reopen(self._file, self.policy.network) is not None
-        ):
-            self._due = _next_due(share)
+        kept = self._windows.reopen(self._file, self.policy.network) if share > 0.0 else None
+        if kept is not None:
+            self._due = _next_due(kept)
 
-    def look_again(self, step: int, share: float) -> None:
+    def look_again(self, share: float) -> None:
         """Look at all frames again if there are new ones, or it is time to; recall all episodes."""
         network = self.policy.network
         self.policy.eval()
@@ -95,7 +94,7 @@ class WindowTeacher:
         else:
             self._windows.recall(network)
         self.policy.train()
-        self._windows.keep(self._file, step)
+        self._windows.keep(self._file, share)
         self._due = _next_due(share)
 
     def lesson(self, rows: Rows, step: int) -> tuple[Tensor, Parts]:
@@ -154,10 +153,18 @@ def set_prior(policy: "HvsBeliefPolicy", demonstrations: Demonstrations) -> None
 
     Args:
         policy: Gets it.
-        demonstrations: With ``privileged`` columns.
+        demonstrations: What it is to learn from.
+
+    Raises:
+        DatasetError: Columns are missing that say what is true.
     """
     network = policy.network
     columns = demonstrations.columns()
+    if missing := sorted({*recorded_keys(tuple(network.shape.cameras))} - {*columns}):
+        raise DatasetError(
+            f"{demonstrations.manifest.root} lacks {', '.join(missing)}, from which hvs_belief "
+            "learns; record it with hvs record"
+        )
     views = network.views(flange_motion(torch.from_numpy(columns[STATE][:, :N_JOINTS]).double()))
     network.belief.set_prior(fit_prior(columns, views, network.cell.period_s))
 

@@ -173,14 +173,19 @@ class WindowPool:
             counts=counts,
         )
 
-    def keep(self, path: Path, step: int) -> None:
-        """Write what the eyes saw and what was made of it, for a killed run to go on with."""
+    def keep(self, path: Path, share: float) -> None:
+        """Write what the eyes saw and what was made of it, for a killed run to go on with.
+
+        Args:
+            path: File to replace.
+            share: Part of the training that is done.
+        """
         assert self._memory is not None
         content = {**self._sightings, MEMORY: self._memory}
         with replacing(path) as temporary:
-            temporary.write_bytes(save(content, {"step": str(step)}))
+            temporary.write_bytes(save(content, {"share": repr(share)}))
 
-    def reopen(self, path: Path, network: BeliefNetwork) -> int | None:
+    def reopen(self, path: Path, network: BeliefNetwork) -> float | None:
         """Read what `keep` wrote of these very frames.
 
         Args:
@@ -188,7 +193,7 @@ class WindowPool:
             network: What the frames are for.
 
         Returns:
-            The step at which they were looked at; None if the file is not there or is of others.
+            When it was written, as a part of the training; None if it is not there, or of others.
         """
         if not path.exists():
             return None
@@ -196,11 +201,11 @@ class WindowPool:
             with safe_open(path, framework="pt") as file:
                 seen = {name: file.get_tensor(name) for name in network.shape.cameras}
                 memory = file.get_tensor(MEMORY)
-                step = int(file.metadata()["step"])
+                share = float(file.metadata()["share"])
         except (SafetensorError, OSError, LookupError, TypeError, ValueError):
             return None
         if any(len(sighting) != len(self._pool) for sighting in seen.values()):
             return None
         self._sightings, self._memory = seen, memory
         self._open(network)
-        return step
+        return share

@@ -31,7 +31,9 @@ PERIOD_S = 0.1
 SIZE = 0.036  # of a 50 mm disc at 70 deg, in image widths at a metre
 TAN = 0.7
 FLAT = torch.tensor([0.09, 0.09, *[1e-10] * 7], dtype=torch.float64)
-DEEP = torch.tensor([0.09, 0.09, 0.01, *[0.01] * 2, 1e-10, *[0.001] * 2, 1e-10], dtype=torch.float64)
+DEEP = torch.tensor(
+    [0.09, 0.09, 0.01, *[0.01] * 2, 1e-10, *[0.001] * 2, 1e-10], dtype=torch.float64
+)
 
 
 def make_belief(variances: torch.Tensor = FLAT) -> Belief:
