@@ -12,7 +12,6 @@ from typing import Final
 
 import jinja2
 from markdown_it import MarkdownIt
-from markupsafe import Markup
 
 from hvs_suite.eval.board import entry_sheet, families, matrix, means, plots, tables
 from hvs_suite.eval.board.clips import SIZE, Clip
@@ -105,19 +104,21 @@ def _environment() -> jinja2.Environment:
 
 def _seen(value: object) -> object:
     """Returns a value for the page, with what is not seen of a text made visible."""
-    return shown(value) if isinstance(value, str) and not isinstance(value, Markup) else value
+    is_markup = hasattr(value, "__html__")
+    return shown(value) if isinstance(value, str) and not is_markup else value
 
 
-def _submitting() -> Markup:
+def _submitting() -> str:
     """Returns ``SUBMITTING.md`` as HTML, its headings one level lower."""
     parser = MarkdownIt("commonmark", {"html": False})
     tokens = parser.parse((_HERE.parent / "SUBMITTING.md").read_text(encoding="utf-8"))
     for token in tokens:
         if token.type in ("heading_open", "heading_close"):
             token.tag = f"h{int(token.tag[1]) + 1}"
-    return Markup(parser.renderer.render(tokens, parser.options, {}))
+    rendered: str = parser.renderer.render(tokens, parser.options, {})
+    return rendered
 
 
-def _own(name: str) -> Markup:
-    """Returns a file of ours that goes into the page as it is."""
-    return Markup((_HERE / name).read_text(encoding="utf-8"))
+def _own(name: str) -> str:
+    """Returns a file of ours."""
+    return (_HERE / name).read_text(encoding="utf-8")
