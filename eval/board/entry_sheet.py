@@ -146,7 +146,10 @@ def _landings(entry: Entry) -> tuple[Landings, str] | None:
         return None
     rows = entry.result.episodes
     picture = plots.landings(rows, plots.landing_radius(rows), tolerance)
-    caption = "Where the flange stands around the target at the time limit, seen along the normal. "
+    caption = (
+        "The picture shows where the flange stands around the target at the time limit, seen along "
+        "the normal. "
+    )
     caption += (
         f"The tolerance, {tolerance:g} mm, lies outside the picture."
         if picture.goal is None
