@@ -23,6 +23,7 @@ SPARE_STEPS = 5
 # so that the last millimetres are met as often as the last decimetres.
 _NEAR_GOAL_SCALE_RAD = (0.002, 0.25)
 _NEAR_GOAL_CLEARANCE_M = 0.015
+_NEAR_GOAL_SLACK_M = 0.002
 MAX_REDRAWS = 1000
 
 
@@ -115,17 +116,38 @@ def _near_goal_start(model: Kinematics, streams: Streams, goal: Goal) -> FloatAr
     best = reachable[np.argsort(times)[: max(1, len(reachable) // 8)]]
     # No surface here bends up, so none rises above the plane that touches it at the target.
     height = float(goal.target @ goal.normal / goal.normal[2])
+    found = _beside(best, model, height, goal.normal, _NEAR_GOAL_CLEARANCE_M, random)
+    if found is None:
+        # Where that plane leans towards the arm it cuts the shoulder, though no surface is there:
+        # then about as far out of it as postures at the goal are.
+        farthest = max(model.clearance(q, height, goal.normal) for q in best)
+        least = farthest - _NEAR_GOAL_SLACK_M
+        found = _beside(best, model, height, goal.normal, least, random)
+    if found is None:
+        raise OptionError(f"no start near the goal found for scenario {streams.index}")
+    return found
+
+
+def _beside(
+    postures: FloatArray,
+    model: Kinematics,
+    height_m: float,
+    normal: FloatArray,
+    clearance_m: float,
+    random: np.random.Generator,
+) -> FloatArray | None:
+    """Joint angles (7,) near one of some postures (n, 7), so far above a plane; None if none is."""
     for _ in range(MAX_REDRAWS):
-        posture = best[random.integers(len(best))].copy()
+        posture = postures[random.integers(len(postures))].copy()
         posture[6] = random.uniform(-1.0, 1.0) * 0.5
         low, high = np.log(_NEAR_GOAL_SCALE_RAD)
         scale = math.exp(random.uniform(low, high))
         q = posture + random.normal(size=7) * scale * [0.5, 0.5, 0.5, 0.5, 1, 1, 2]
         if (np.abs(q) < JOINT_RANGE_RAD).all() and (
-            model.clearance(q, height, goal.normal) >= _NEAR_GOAL_CLEARANCE_M
+            model.clearance(q, height_m, normal) >= clearance_m
         ):
             return q
-    raise OptionError(f"no start near the goal found for scenario {streams.index}")
+    return None
 
 
 def steps_lower_bound(spec: Spec, start: FloatArray, goal: Goal) -> int:

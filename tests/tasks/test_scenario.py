@@ -329,6 +329,13 @@ def test_starts_near_the_goal_are_near_and_clear(start: str, surface: str) -> No
         assert 0.25 < upright.mean() < 0.75
 
 
+def test_a_panel_that_leans_towards_the_arm_has_starts_near_the_goal() -> None:
+    draws = source("surface-fuselage", "train", start="mixed")
+    scene = draws.draw(459)  # its plane, were it endless, would cut the shoulder
+    goal = scene.target + 0.05 * scene.normal
+    assert np.linalg.norm(kinematics().flange_pose(scene.start)[1] - goal) < 0.30
+
+
 @pytest.mark.parametrize("surface", ["tilted", "curved"])
 def test_targets_on_other_surfaces_lie_on_them_and_within_reach(surface: str) -> None:
     draws = source("align-thesis", "train", surface=surface)
