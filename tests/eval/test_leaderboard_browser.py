@@ -206,6 +206,7 @@ def test_it_opens_an_entry_and_closes_it(view: Any) -> None:
     )
     assert sheet.locator("img").count() == 2
     assert sheet.locator("svg.landing path.hit").count() == 1
+    assert sheet.locator("tbody tr:visible").count() == 4
     width = view.evaluate("(d => [d.scrollWidth, d.clientWidth])(document.querySelector('[open]'))")
     assert width[0] <= width[1]
     place = view.evaluate("scrollY")
