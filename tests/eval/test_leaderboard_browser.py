@@ -202,7 +202,7 @@ def test_it_opens_an_entry_and_closes_it(view: Any) -> None:
     assert sheet.locator("h2").inner_text().split() == ["beta", "align-hard-v1"]
     assert sheet.locator("dl.figures").inner_text().count("3 of 10") == 1
     view.wait_for_function(
-        "() => [...document.querySelectorAll('[open] .films img')].every(i => i.naturalWidth > 0)"
+        "() => [...document.querySelectorAll('dialog[open] img')].every(i => i.naturalWidth > 0)"
     )
     assert sheet.locator("img").count() == 2
     assert sheet.locator("svg.landing path.hit").count() == 1
