@@ -18,7 +18,7 @@ from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared.family import register
 from hvs_suite.tasks.shared.goal import Goal
 from hvs_suite.tasks.shared.placing import HARD, Placing, PlacingSpec, is_reachable
-from hvs_suite.tasks.shared.scenario import Scenario, Streams, draw_look
+from hvs_suite.tasks.shared.scenario import Scenario, Streams
 from hvs_suite.tasks.shared.spec import Description, in_words, scene
 
 if TYPE_CHECKING:
@@ -140,16 +140,11 @@ class Align(Placing[AlignSpec, AlignScenario]):
 
     def draw(self, streams: Streams) -> AlignScenario:
         """Draw target, start and look."""
-        from hvs_suite.tasks.shared.start import draw_start
-
         goal = self._draw_goal(streams)
         # The plane through the origin that the whole surface lies in or below.
         floor_normal = np.asarray(self._surface.normal(0.0, 0.0))
-        own = self.named.start if self.named is not None else "zero"
-        start = draw_start(self.spec, own, streams, goal, floor_normal)
-        return AlignScenario(
-            target=goal.target, normal=goal.normal, start=start, **draw_look(self.spec, streams)
-        )
+        common = self.draw_common(streams, goal, floor_normal)
+        return AlignScenario(target=goal.target, normal=goal.normal, **common)
 
     def _draw_goal(self, streams: Streams) -> Goal:
         asked = self.spec.goal

@@ -12,20 +12,28 @@ learns where holes are on average, which is not enough; the way to search has to
 """
 
 import dataclasses
-import math
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from hvs_suite.embodiment import Embodiment, Tool
 from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared.family import Family, Progress, register
-from hvs_suite.tasks.shared.goal import HEIGHT, LATERAL, TILT, Goal, Keypoint, Tip, goal_errors
+from hvs_suite.tasks.shared.goal import (
+    HEIGHT,
+    LATERAL,
+    TILT,
+    UP,
+    Goal,
+    Keypoint,
+    Tip,
+    goal_errors,
+)
 from hvs_suite.tasks.shared.metric import Metric
-from hvs_suite.tasks.shared.placing import HARD, UP, RingSpec, is_reachable, point_on_ring
-from hvs_suite.tasks.shared.scenario import Scenario, Streams, draw_look
+from hvs_suite.tasks.shared.peg_and_bushing import PegAndBushing, PegSpec
+from hvs_suite.tasks.shared.placing import HARD, is_reachable, point_on_ring
+from hvs_suite.tasks.shared.scenario import Scenario, Streams
 from hvs_suite.tasks.shared.spec import Description, VectorObservation, scene
 
 if TYPE_CHECKING:
@@ -42,25 +50,15 @@ PEAK_FORCE = "peak_force_n"
 WRENCH = "wrench"
 LIFT_M = 0.050
 """How far above the mouth the tip comes from (m): the peg does not hide the bushing yet."""
-BOTTOM_M = 0.003
-"""Material below the hole; as the cell's, spelled out because that loads MuJoCo."""
-MIN_CLEARANCE_MM = 0.05
-"""What the physics was shown to hold."""
-FORCE_LOW_PASS_HZ = 50.0
 _IN_HOLE_MM = 0.1
 """A tip is in the hole where it is off by the clearance and so much for tilt and give."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class InsertSpec(RingSpec):
+class InsertSpec(PegSpec):
     """Every parameter of ``insert``.
 
     Attributes:
-        peg_diameter_m: Diameter of the peg (m).
-        peg_length_m: Its length (m).
-        clearance_mm: By how much the hole's radius is larger (mm).
-        chamfer_mm: Width and depth of the chamfer at the hole's mouth (mm).
-        hole_depth_m: Depth of the hole (m).
         goal_depth_m: How deep the tip shall be (m).
         depth_tolerance_mm: By how much it may miss that (mm).
         tilt_tolerance_deg: Bound on the angle between peg and hole.
@@ -69,8 +67,6 @@ class InsertSpec(RingSpec):
             at two sigma.
         force_noise_n: Standard deviation of the noise on measured forces (N).
         torque_noise_nm: Standard deviation of the noise on measured torques (Nm).
-        stiffness: Joint stiffness, as a share of the stiff position controller's.
-        physics_hz: Physics steps a second.
     """
 
     family: ClassVar[str] = "insert"
@@ -78,12 +74,6 @@ class InsertSpec(RingSpec):
     further_privileged: ClassVar[Mapping[str, tuple[str, ...]]] = {"hole_offset": ("x", "y")}
     plays_on: ClassVar[bool] = False
 
-    target_diameter_m: float = 0.040
-    peg_diameter_m: float = 0.010
-    peg_length_m: float = scene(0.050)
-    clearance_mm: float = 0.5
-    chamfer_mm: float = 1.0
-    hole_depth_m: float = 0.015
     goal_depth_m: float = 0.013
     depth_tolerance_mm: float = 1.0
     tilt_tolerance_deg: float = 1.0
@@ -91,8 +81,6 @@ class InsertSpec(RingSpec):
     hole_noise_mm: float = scene(0.0)
     force_noise_n: float = 0.3
     torque_noise_nm: float = 0.01
-    stiffness: float = 0.05
-    physics_hz: int = 480
 
     def __post_init__(self) -> None:
         """Refuse values that make no sense, with a sentence.
@@ -101,62 +89,13 @@ class InsertSpec(RingSpec):
             OptionError: One of them does not.
         """
         super().__post_init__()
-        self._check(
-            "must be positive",
-            lambda value: value > 0,
-            "peg_diameter_m",
-            "chamfer_mm",
-            "depth_tolerance_mm",
-            "tilt_tolerance_deg",
-            "force_limit_n",
-        )
-        self._check(
-            "cannot be negative",
-            lambda value: value >= 0,
-            "hole_noise_mm",
-            "force_noise_n",
-            "torque_noise_nm",
-        )
-        self._check("must lie between 0.01 and 1", lambda value: 0.01 <= value <= 1.0, "stiffness")
-        self._check("must be at least 240", lambda value: value >= 240, "physics_hz")
-        self._check_shape()
-
-    def _check_shape(self) -> None:
-        """Refuse pegs and holes that cannot be.
-
-        Raises:
-            OptionError: They cannot.
-        """
-        widest = 500.0 * (self.target_diameter_m - self.peg_diameter_m) - self.chamfer_mm
-        if not MIN_CLEARANCE_MM <= self.clearance_mm < widest:
-            raise OptionError(
-                f"clearance_mm is {self.clearance_mm}; use {MIN_CLEARANCE_MM} (tighter the physics "
-                f"does not hold) to {widest:.1f} mm, which a bushing of "
-                f"{1000 * self.target_diameter_m:.0f} mm leaves"
-            )
-        if not self.hole_depth_m > 0.001 * self.chamfer_mm:
-            raise OptionError(f"hole_depth_m is {self.hole_depth_m}; it is deeper than its chamfer")
+        self._check_positive("depth_tolerance_mm", "tilt_tolerance_deg", "force_limit_n")
+        self._check_not_negative("hole_noise_mm", "force_noise_n", "torque_noise_nm")
         if not 0.0 < self.goal_depth_m < min(self.hole_depth_m, self.peg_length_m):
             raise OptionError(
                 f"goal_depth_m is {self.goal_depth_m}; it must be positive, and less than the "
                 "depth of the hole and the length of the peg"
             )
-
-    @property
-    def embodiment(self) -> Embodiment:
-        """The arm with the peg, compliant, and physics fine enough for contacts."""
-        return Embodiment(
-            tool=Tool(self.peg_diameter_m, self.peg_length_m),
-            stiffness=self.stiffness,
-            timestep_s=1.0 / self.physics_hz,
-            impratio=10.0,
-            noslip_iterations=0,
-        )
-
-    @property
-    def top_m(self) -> float:
-        """Height of the hole's mouth above the surface (m)."""
-        return BOTTOM_M + self.hole_depth_m
 
     @property
     def look_from_m(self) -> float:
@@ -180,12 +119,6 @@ class InsertSpec(RingSpec):
         noise = 3 * (self.force_noise_n,) + 3 * (self.torque_noise_nm,)
         names = ("fx", "fy", "fz", "tx", "ty", "tz")
         return {WRENCH: VectorObservation(names, -200.0, 200.0, noise)}
-
-    @property
-    def hole_share(self) -> float:
-        """Share of the bushing's face that its mouth takes."""
-        mouth_m = self.peg_diameter_m + 0.002 * (self.clearance_mm + self.chamfer_mm)
-        return (mouth_m / self.target_diameter_m) ** 2
 
     @property
     def needed_depth_mm(self) -> float:
@@ -254,21 +187,8 @@ class Insert(Family[InsertSpec, InsertScenario]):
 
     def build(self, cell: "Cell") -> None:
         """Stand the bushing there, with its hole, and feel what the peg presses with."""
-        from hvs_suite.cell.bushing import Bushing, Hole
-
-        spec = self.spec
         self._check_reach()
-        shape: dict[str, Any] = {
-            "diameter_m": spec.target_diameter_m,
-            "hole_diameter_m": spec.peg_diameter_m + 0.002 * spec.clearance_mm,
-            "hole_depth_m": spec.hole_depth_m,
-            "chamfer_m": 0.001 * spec.chamfer_mm,
-        }
-        self._bushing, self._hole = Bushing(**shape), Hole(**shape)
-        cell.add_marker(self._bushing)
-        cell.add_prop(self._hole)
-        self._robot = cell.robot.mjcf_model
-        self._contact = self._hole.add_force_sensor(cell, self._robot)
+        self._peg = PegAndBushing(cell, self.spec)
 
     def _check_reach(self) -> None:
         embodiment = self.spec.embodiment
@@ -285,49 +205,24 @@ class Insert(Family[InsertSpec, InsertScenario]):
                 )
 
     def after_compile(self, physics: "mjcf.Physics") -> None:
-        """Look up what may touch, and the sensors."""
-        from hvs_suite.cell.tool import PEG_GEOMS, Wrench
-
-        model = physics.model
-        self._sensor = int(model.sensor_adr[physics.bind(self._contact).element_id])
-        self._wrench = Wrench(physics, self._robot)
-        pegs = [self._robot.find("geom", name) for name in PEG_GEOMS]
-        self._is_peg = np.zeros(model.ngeom, bool)
-        self._is_peg[physics.bind(pegs).element_id] = True
-        self._is_hole = np.zeros(model.ngeom, bool)
-        self._is_hole[physics.bind(self._hole.geoms).element_id] = True
-        self.marker_geom = int(physics.bind(self._bushing.geom).element_id)
-        bodies = model.geom_bodyid[[self.marker_geom, int(np.argmax(self._is_hole))]]
-        self._mocaps = model.body_mocapid[bodies]
+        """Look up the bushing and what is felt."""
+        self._peg.after_compile(physics)
+        self.marker_geom = self._peg.marker_geom
 
     def draw(self, streams: Streams) -> InsertScenario:
         """Draw where the bushing stands, how far the hole is off, start and look."""
-        from hvs_suite.tasks.shared.start import draw_start
-
         spec = self.spec
         place = np.array([*point_on_ring(spec.ring_m, streams.generator("target")), 0.0])
         offset = 0.001 * spec.hole_noise_mm * streams.cut_normal("hole", 2)
-        goal = Goal(place + np.append(offset, spec.top_m), UP, -spec.goal_depth_m)
-        own = self.named.start if self.named is not None else "zero"
-        above = dataclasses.replace(goal, standoff_m=LIFT_M)
-        start = draw_start(spec, own, streams, above, UP)
-        return InsertScenario(
-            target=place, hole_offset=offset, start=start, **draw_look(spec, streams)
-        )
+        above = Goal(place + np.append(offset, spec.top_m), UP, LIFT_M)
+        return InsertScenario(target=place, hole_offset=offset, **self.draw_common(streams, above))
 
     def begin(self, physics: "mjcf.Physics", scenario: InsertScenario) -> None:
         """Put the bushing where it stands, and its hole where that is."""
-        import mujoco
-
         super().begin(physics, scenario)
-        data = physics.data.ptr
-        painted = scenario.target
-        hole = painted + np.append(scenario.hole_offset, 0.0)
-        data.mocap_pos[self._mocaps] = [painted, hole]
-        # The picture that follows shows where bodies were computed to be.
-        mujoco.mj_kinematics(physics.model.ptr, data)
+        hole = scenario.target + np.append(scenario.hole_offset, 0.0)
+        self._peg.begin(physics, scenario.target, hole)
         self._goal = Goal(hole + self.spec.top_m * UP, UP, -self.spec.goal_depth_m)
-        self._force = self._peak_n = self._felt_at_s = 0.0
 
     def goal(self, ahead_s: float = 0.0) -> Goal:
         """In the hole itself, at any time."""
@@ -346,7 +241,7 @@ class Insert(Family[InsertSpec, InsertScenario]):
         self, physics: "mjcf.Physics", errors: Mapping[str, float], progress: Progress
     ) -> dict[str, float]:
         """The largest force so far."""
-        return {PEAK_FORCE: self._peak_n}
+        return {PEAK_FORCE: self._peg.peak_n}
 
     def at_reset(self) -> dict[str, float]:
         """No force yet."""
@@ -354,27 +249,8 @@ class Insert(Family[InsertSpec, InsertScenario]):
 
     def is_forbidden(self, physics: "mjcf.Physics") -> bool:
         """Whether something else than peg and bushing touches, or these too hard."""
-        data = physics.data.ptr
-        self._feel(data.sensordata[self._sensor : self._sensor + 3], data.time)
-        first, second = data.contact.geom.T
-        allowed = (self._is_peg[first] & self._is_hole[second]) | (
-            self._is_hole[first] & self._is_peg[second]
-        )
-        return self._peak_n > self.spec.force_limit_n or not allowed.all()
-
-    def _feel(self, force: FloatArray, time_s: float) -> None:
-        """Take in the contact force (3,) N of the last physics step, through the low-pass.
-
-        Steps without contact are not told of; the low-pass forgets in between.
-        """
-        rate = 2.0 * math.pi * FORCE_LOW_PASS_HZ
-        step_s = 1.0 / self.spec.physics_hz
-        idle_s = max(time_s - self._felt_at_s - step_s, 0.0)
-        keep = math.exp(-rate * step_s)
-        pressed = (1.0 - keep) * float(np.linalg.norm(force))
-        self._force = keep * math.exp(-rate * idle_s) * self._force + pressed
-        self._felt_at_s = time_s
-        self._peak_n = max(self._peak_n, self._force)
+        self._peg.feel(physics)
+        return self._peg.peak_n > self.spec.force_limit_n or self._peg.touches_else(physics)
 
     def keypoints(self) -> dict[str, Keypoint]:
         """The middle of the painted face."""
@@ -383,7 +259,7 @@ class Insert(Family[InsertSpec, InsertScenario]):
 
     def observe(self, physics: "mjcf.Physics") -> dict[str, FloatArray]:
         """What the tool feels."""
-        return {WRENCH: self._wrench.read(physics)}
+        return {WRENCH: self._peg.wrench(physics)}
 
     def privileged(self) -> dict[str, FloatArray]:
         """How far the hole is off its paint (m)."""

@@ -18,7 +18,7 @@ from hvs_suite.tasks.shared.family import Progress, register
 from hvs_suite.tasks.shared.goal import Goal
 from hvs_suite.tasks.shared.metric import Metric
 from hvs_suite.tasks.shared.placing import HARD, Placing, PlacingSpec
-from hvs_suite.tasks.shared.scenario import Scenario, Streams, draw_look
+from hvs_suite.tasks.shared.scenario import Scenario, Streams
 from hvs_suite.tasks.shared.spec import Description, scene
 
 if TYPE_CHECKING:
@@ -121,13 +121,9 @@ class Sequence(Placing[SequenceSpec, SequenceScenario]):
 
     def draw(self, streams: Streams) -> SequenceScenario:
         """Draw targets, start and look."""
-        from hvs_suite.tasks.shared.start import draw_start
-
         targets = self._draw_targets(streams)
         first = self.goal_over(*targets[0, :2])
-        own = self.named.start if self.named is not None else "zero"
-        start = draw_start(self.spec, own, streams, first, first.normal)
-        return SequenceScenario(targets=targets, start=start, **draw_look(self.spec, streams))
+        return SequenceScenario(targets=targets, **self.draw_common(streams, first))
 
     def _draw_targets(self, streams: Streams) -> FloatArray:
         places: list[tuple[float, float]] = []

@@ -26,58 +26,30 @@ import numpy.typing as npt
 from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared.family import register
 from hvs_suite.tasks.shared.goal import Goal
-from hvs_suite.tasks.shared.placing import HARD, UP, Placing, PlacingSpec, is_reachable
-from hvs_suite.tasks.shared.scenario import Scenario, Streams, draw_look
+from hvs_suite.tasks.shared.panels import OFF_CENTRE_M, SIDE_M, Panels, PanelSpec
+from hvs_suite.tasks.shared.placing import HARD, Placing, is_reachable
+from hvs_suite.tasks.shared.scenario import Scenario, Streams
 from hvs_suite.tasks.shared.spec import Description, scene
 
 if TYPE_CHECKING:
     from dm_control import mjcf
 
     from hvs_suite.cell.arena import Cell
-    from hvs_suite.cell.panel import Panel
     from hvs_suite.cell.solid import Solid
     from hvs_suite.tasks.shared.certificate import Check
     from hvs_suite.tasks.shared.environment import Environment
 
 FloatArray = npt.NDArray[np.float64]
 
-SIDE_M = 0.24
-"""Of a panel: none comes near the base, wherever on the ring its target lies."""
-OFF_CENTRE_M = 0.05
-"""How far from the middle of its panel a target may lie, along either side (m)."""
-N_PANELS = 16
-"""Curved panels in the model, evenly spaced in curvature; a scene sets up one of them."""
-MARK_HALF_THICKNESS_M = 0.00004
-"""Of the marks (m): on thicker ones the eye would see the sides as well."""
-MAX_TILT_DEG = 20.0
-MAX_RAISE_M = 0.15
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SurfaceSpec(PlacingSpec):
-    """Every parameter of ``surface``.
-
-    Attributes:
-        tilt_deg: Least and largest tilt of a panel (deg).
-        raise_m: Least and largest distance of its lowest point from the table (m).
-        radius_m: Least and largest radius of its skin (m); None for flat plates.
-        seams: Whether seams, rivets and stains are on it.
-        n_marks: Marks around the target.
-        mark_diameter_m: Their diameter (m).
-        mark_ring_m: Radius of the ring that they lie on (m).
-    """
+class SurfaceSpec(PanelSpec):
+    """Every parameter of ``surface``."""
 
     family: ClassVar[str] = "surface"
 
     ring_m: tuple[float, float] = scene((0.47, 0.70))
     target_diameter_m: float = 0.020
-    tilt_deg: tuple[float, float] = scene((0.0, 15.0))
-    raise_m: tuple[float, float] = scene((0.0, 0.08))
-    radius_m: tuple[float, float] | None = scene(None)
-    seams: bool = False
-    n_marks: int = 8
-    mark_diameter_m: float = 0.005
-    mark_ring_m: float = scene(0.025)
 
     def __post_init__(self) -> None:
         """Refuse values that make no sense, with a sentence.
@@ -90,33 +62,6 @@ class SurfaceSpec(PlacingSpec):
             raise OptionError(f"marker is {self.marker!r}; surface's targets are discs")
         if self.start == "fixed":
             raise OptionError("start is 'fixed', where some panel would stand; use zero or random")
-        for name, most in (("tilt_deg", MAX_TILT_DEG), ("raise_m", MAX_RAISE_M)):
-            low, high = getattr(self, name)
-            if not 0.0 <= low <= high <= most:
-                raise OptionError(f"{name} is {(low, high)}; use a least and a larger up to {most}")
-        if self.radius_m is not None and not 0.5 <= self.radius_m[0] <= self.radius_m[1]:
-            raise OptionError(f"radius_m is {self.radius_m}; use a least from 0.5 m and a larger")
-        if not 3 <= self.n_marks <= 24:
-            raise OptionError(f"n_marks is {self.n_marks}; use 3 to 24, fewer show no slope")
-        self._check("must be positive", lambda value: value > 0, "mark_diameter_m")
-        outer = self.mark_ring_m + 0.5 * self.mark_diameter_m
-        if not self.mark_ring_m > 0.5 * (self.target_diameter_m + self.mark_diameter_m):
-            raise OptionError(f"mark_ring_m is {self.mark_ring_m}: the marks overlap the target")
-        if outer + OFF_CENTRE_M > 0.5 * SIDE_M:
-            raise OptionError(f"mark_ring_m is {self.mark_ring_m}: the marks leave the panel")
-        if 2.0 * self.mark_ring_m * math.sin(math.pi / self.n_marks) <= self.mark_diameter_m:
-            raise OptionError(f"n_marks is {self.n_marks}: so many overlap; use fewer, or smaller")
-
-    @property
-    def sag_m(self) -> float:
-        """How far the marks lie below the plane that touches the skin at the target (m).
-
-        On the average over the ring and over the radii: they do so across the cylinder's axis, by
-        r^2 / 2R, and not at all along it.
-        """
-        if self.radius_m is None:
-            return 0.0
-        return 0.25 * self.mark_ring_m**2 * 0.5 * sum(1.0 / radius for radius in self.radius_m)
 
     def describe(self) -> Description:
         """The task in words."""
@@ -176,36 +121,8 @@ class Surface(Placing[SurfaceSpec, SurfaceScenario]):
 
     def build(self, cell: "Cell") -> None:
         """Attach target, marks and panels."""
-        from hvs_suite.cell.marker import Marker
-
         super().build(cell)
-        spec = self.spec
-        self._marks = [
-            Marker(
-                diameter_m=spec.mark_diameter_m,
-                name=f"mark-{number}",
-                half_thickness_m=MARK_HALF_THICKNESS_M,
-            )
-            for number in range(spec.n_marks)
-        ]
-        for mark in self._marks:
-            cell.add_marker(mark)
-        self._panels = self._make_panels()
-        for panel in self._panels:
-            cell.add_prop(panel)
-
-    def _make_panels(self) -> "list[Panel]":
-        from hvs_suite.cell.panel import Panel
-
-        spec = self.spec
-        curvatures = [0.0]
-        if spec.radius_m is not None:
-            low, high = spec.radius_m
-            curvatures = np.linspace(1.0 / high, 1.0 / low, N_PANELS).tolist()
-        return [
-            Panel(f"panel-{number}", SIDE_M, curvature, number if spec.seams else None)
-            for number, curvature in enumerate(curvatures)
-        ]
+        self._panels = Panels(cell, self.spec)
 
     def check_reach(self) -> None:
         """Check that the arm reaches the ring, however the panel stands.
@@ -228,43 +145,15 @@ class Surface(Placing[SurfaceSpec, SurfaceScenario]):
 
     def draw(self, streams: Streams) -> SurfaceScenario:
         """Draw the panel, the target on it, start and look."""
-        from scipy.spatial.transform import Rotation
-
-        from hvs_suite.tasks.shared.start import draw_start
-
         spec = self.spec
         place = self.draw_on_ring(streams.generator("target"))
-        random = streams.generator("panel")
-        index = int(random.integers(len(self._panels)))
-        panel = self._panels[index]
-        yaw, towards, around = random.uniform(-math.pi, math.pi, 3)
-        tilt = math.radians(random.uniform(*spec.tilt_deg))
-        lean = Rotation.from_rotvec([tilt * math.cos(towards), tilt * math.sin(towards), 0.0])
-        turn = lean * Rotation.from_rotvec(yaw * UP)
-        x, y = random.uniform(-OFF_CENTRE_M, OFF_CENTRE_M, 2)
-        angles = around + 2.0 * math.pi * np.arange(spec.n_marks) / spec.n_marks
-        ring = spec.mark_ring_m * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        local = [panel.skin(x, y), *(panel.skin(x + dx, y + dy) for dx, dy in ring)]
-        points, normals = (turn.apply([each[i] for each in local]) for i in (0, 1))
-        lowest = turn.apply(panel.corners())[:, 2].min()
-        height = random.uniform(*spec.raise_m) - lowest
-        position = np.array([place[0] - points[0, 0], place[1] - points[0, 1], height])
-        look = draw_look(spec, streams)
-        goal = Goal(points[0] + position, normals[0], spec.standoff_m)
-        own = self.named.start if self.named is not None else "zero"
-        rotation_vector = turn.as_rotvec()
-        solids = (panel.solid(position, rotation_vector),)
+        set_up = self._panels.draw(streams.generator("panel"), place)
+        goal = Goal(set_up["target"], set_up["normal"], spec.standoff_m)
+        solid = self._panels.solid(set_up["panel"], set_up["panel_position"], set_up["panel_turn"])
         return SurfaceScenario(
-            target=goal.target,
-            normal=goal.normal,
-            marks=points[1:] + position,
-            mark_normals=normals[1:],
-            panel=index,
-            panel_position=position,
-            panel_turn=rotation_vector,
             panel_rgb=self._draw_paint(streams),
-            start=draw_start(spec, own, streams, goal, UP, solids),
-            **look,
+            **set_up,
+            **self.draw_common(streams, goal, solids=(solid,)),
         )
 
     def _draw_paint(self, streams: Streams) -> FloatArray:
@@ -277,33 +166,16 @@ class Surface(Placing[SurfaceSpec, SurfaceScenario]):
     def after_compile(self, physics: "mjcf.Physics") -> None:
         """Look up target, marks and panels in the compiled model."""
         super().after_compile(physics)
-        model = physics.model
-        things = [each.geom for each in self._marks] + [each.geom for each in self._panels]
-        geoms = [int(physics.bind(geom).element_id) for geom in things]
-        rows = [int(model.body_mocapid[model.geom_bodyid[geom]]) for geom in geoms]
-        n = len(self._marks)
-        self._mark_rows, self._panel_rows, self._panel_geoms = rows[:n], rows[n:], geoms[n:]
+        self._panels.after_compile(physics)
 
     def begin(self, physics: "mjcf.Physics", scenario: SurfaceScenario) -> None:
-        """Set up the panel, park the others, and lay target and marks on the skin."""
-        from scipy.spatial.transform import Rotation
-
-        from hvs_suite.cell.marker import orientation
-        from hvs_suite.cell.prop import PARKED_M
-
+        """Set up the panel, and lay target and marks on its skin."""
         super().begin(physics, scenario)
-        data, row = physics.data.ptr, self._panel_rows[scenario.panel]
-        turn = Rotation.from_rotvec(scenario.panel_turn)
-        data.mocap_pos[self._panel_rows] = PARKED_M
-        data.mocap_pos[row] = scenario.panel_position
-        data.mocap_quat[row] = turn.as_quat(scalar_first=True)
-        # A geom's own colour hides its material's, which is put back for every scene.
-        physics.model.ptr.geom_rgba[self._panel_geoms[scenario.panel], :3] = scenario.panel_rgb
-        data.mocap_pos[self._mark_rows] = scenario.marks
-        data.mocap_quat[self._mark_rows] = [orientation(n) for n in scenario.mark_normals]
+        index, position, turn = scenario.panel, scenario.panel_position, scenario.panel_turn
+        self._panels.set_up(physics, index, position, turn, scenario.panel_rgb)
+        self._panels.lay_marks(physics, scenario.marks, scenario.mark_normals)
         self._goal = Goal(scenario.target, scenario.normal, self.spec.standoff_m)
-        panel = self._panels[scenario.panel]
-        self._solids = (panel.solid(scenario.panel_position, scenario.panel_turn),)
+        self._solids = (self._panels.solid(index, position, turn),)
         self.put_marker(physics, self._goal)
 
     def goal(self, ahead_s: float = 0.0) -> Goal:

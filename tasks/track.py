@@ -7,6 +7,7 @@ show where the target was: the arm trails its set point, and a policy has to aim
 """
 
 import dataclasses
+import math
 from collections import deque
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, ClassVar, Literal
@@ -16,11 +17,11 @@ import numpy.typing as npt
 
 from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared.family import Progress, register
-from hvs_suite.tasks.shared.goal import POSITION, TILT, Goal
+from hvs_suite.tasks.shared.goal import POSITION, TILT, UP, Goal
 from hvs_suite.tasks.shared.metric import Metric
 from hvs_suite.tasks.shared.motion import Motion, draw_curve, draw_line
-from hvs_suite.tasks.shared.placing import HARD, UP, Placing, PlacingSpec
-from hvs_suite.tasks.shared.scenario import Scenario, Streams, draw_look
+from hvs_suite.tasks.shared.placing import HARD, Placing, PlacingSpec
+from hvs_suite.tasks.shared.scenario import Scenario, Streams
 from hvs_suite.tasks.shared.spec import Description, scene
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ class TrackSpec(PlacingSpec):
             OptionError: One of them does not.
         """
         super().__post_init__()
-        self._check("must be positive", lambda value: value > 0, "acceleration_m_s2", "motion_s")
+        self._check_positive("acceleration_m_s2", "motion_s")
         if not 0.0 < self.speed_m_s[0] <= self.speed_m_s[1]:
             raise OptionError(f"speed_m_s is {self.speed_m_s}; use a least and a larger speed")
         if self.position_tolerance_mm is None:
@@ -148,16 +149,9 @@ class Track(Placing[TrackSpec, TrackScenario]):
 
     def draw(self, streams: Streams) -> TrackScenario:
         """Draw motion, start and look."""
-        from hvs_suite.tasks.shared.start import draw_start
-
         motion = self._draw_motion(streams)
         first = self.goal_over(*motion.place(0.0))
-        own = self.named.start if self.named is not None else "zero"
-        return TrackScenario(
-            motion=motion,
-            start=draw_start(self.spec, own, streams, first, first.normal),
-            **draw_look(self.spec, streams),
-        )
+        return TrackScenario(motion=motion, **self.draw_common(streams, first))
 
     def _draw_motion(self, streams: Streams) -> Motion:
         """Draw motions until one stays on the ring for the whole episode."""
@@ -185,19 +179,28 @@ class Track(Placing[TrackSpec, TrackScenario]):
         super().begin(physics, scenario)
         self._last: deque[Mapping[str, float]] = deque(maxlen=self.spec.hold_steps)
         self._n_inside = self._n_counted = 0
+        # All goals at once: one after each picture takes several times as long, because drawing
+        # leaves nothing of the code in the processor's caches.
+        times = [n * self.spec.control_period_s for n in range(self.spec.time_limit_steps + 1)]
+        self._goals = {time_s: self._goal_at(time_s) for time_s in times}
         self.advance(physics, 0.0)
 
     def advance(self, physics: "mjcf.Physics", time_s: float) -> None:
         """Move the marker to where it is at a time."""
-        self._time_s = time_s
-        self.put_marker(physics, self.goal())
+        self._time_s, self._goal = time_s, self._goals.get(time_s) or self._goal_at(time_s)
+        self.put_marker(physics, self._goal)
 
     def goal(self, ahead_s: float = 0.0) -> Goal:
         """Over where the target is, or will be."""
-        time_s = self._time_s + ahead_s
-        x, y = self.scenario.motion.place(time_s).tolist()
-        velocity = np.append(self.scenario.motion.speed(time_s), 0.0)
-        return Goal(np.array([x, y, 0.0]), UP, self.spec.standoff_m, velocity)
+        return self._goal_at(self._time_s + ahead_s) if ahead_s else self._goal
+
+    def _goal_at(self, time_s: float) -> Goal:
+        motion = self.scenario.motion
+        x, y = motion.place(time_s).tolist()
+        vx, vy = motion.speed(time_s).tolist()
+        return Goal(
+            np.array([x, y, 0.0]), UP, self.spec.standoff_m, velocity=np.array([vx, vy, 0.0])
+        )
 
     def privileged(self) -> dict[str, FloatArray]:
         """How fast the goal moves, (3,) m/s."""
@@ -215,11 +218,11 @@ class Track(Placing[TrackSpec, TrackScenario]):
         if progress.steps > SETTLING_STEPS:
             self._n_counted += 1
             self._n_inside += progress.is_inside
-        positions = np.array([each[POSITION] for each in self._last])
+        positions = [each[POSITION] for each in self._last]
         return {
-            WORST_POSITION: float(positions.max()),
-            WORST_TILT: max(each[TILT] for each in self._last),
-            RMS_POSITION: float(np.sqrt(np.mean(positions**2))),
+            WORST_POSITION: max(positions),
+            WORST_TILT: max([each[TILT] for each in self._last]),
+            RMS_POSITION: math.sqrt(np.add.reduce(np.square(positions)) / len(positions)),
             TIME_INSIDE: 100.0 * self._n_inside / max(self._n_counted, 1),
         }
 

@@ -5,6 +5,8 @@ changes contexts; together they cost several times what drawing the picture does
 keeps everything and hands out copies.
 """
 
+import functools
+import math
 import weakref
 from typing import Any
 
@@ -15,13 +17,20 @@ import numpy.typing as npt
 from hvs_suite.cell import gl
 from hvs_suite.errors import RenderError
 
+FloatArray = npt.NDArray[np.float64]
+
 # Collision capsules live in group 3 and are never drawn.
 _HIDDEN_GROUP = 3
+# The graphics library rounds to single precision.
+_SLACK_M = 1e-3
 _MAX_GEOMS = 256
 
 
 class Renderer:
     """Draws one model offscreen; made when the first picture is asked for.
+
+    The eye in the hand sees a few of the arm's shells. The others are not sent to the graphics
+    library, which would work on every corner before it finds that nothing shows.
 
     Args:
         model: Compiled model; its textures and meshes are uploaded once.
@@ -49,6 +58,10 @@ class Renderer:
         self._option = mujoco.MjvOption()
         self._option.geomgroup[_HIDDEN_GROUP] = 0
         self._option.sitegroup[:] = 0
+        self._draws_all = studio
+        # Around its centre, how far a geom reaches; MuJoCo has 0 for planes, which may be endless.
+        radius = model.geom_rbound
+        self._radius = np.where(radius > 0.0, radius + _SLACK_M, np.inf)
         self._perturbation = mujoco.MjvPerturb()
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED.value
@@ -142,21 +155,37 @@ class Renderer:
                 "this renderer was made for"
             )
         self._make_current()
+        groups = self._model.geom_group
+        compiled = groups.copy()
         if isinstance(camera, int):
+            # A camera that nothing carries sees most of the cell. What casts a shadow may be out of
+            # view itself.
+            if self._model.cam_bodyid[camera] and not self._draws_all:
+                groups[self._out_of_view(data, camera, width / height)] = _HIDDEN_GROUP
             self._camera.fixedcamid = camera
             camera = self._camera
-        mujoco.mjv_updateScene(
-            self._model,
-            data,
-            self._option,
-            self._perturbation,
-            camera,
-            mujoco.mjtCatBit.mjCAT_ALL.value,
-            self._scene,
-        )
+        try:
+            mujoco.mjv_updateScene(
+                self._model,
+                data,
+                self._option,
+                self._perturbation,
+                camera,
+                mujoco.mjtCatBit.mjCAT_ALL.value,
+                self._scene,
+            )
+        finally:
+            groups[:] = compiled
         rect = mujoco.MjrRect(0, 0, width, height)
         mujoco.mjr_render(rect, self._scene, self._context)
         return rect
+
+    def _out_of_view(self, data: mujoco.MjData, camera: int, aspect: float) -> npt.NDArray[np.bool]:
+        """Which geoms lie wholly beside what a camera sees, or behind it, (n,)."""
+        axes = data.cam_xmat[camera].reshape(3, 3)
+        normals = axes @ _sides(self._model.cam_fovy[camera].item(), aspect)
+        distance = (data.geom_xpos - data.cam_xpos[camera]) @ normals
+        return distance.max(axis=1) > self._radius
 
     def _make_current(self) -> None:
         if not self._free.alive:
@@ -206,6 +235,25 @@ def offscreen_context(
         size.offwidth, size.offheight, quality.offsamples, quality.shadowsize = kept
     mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
     return context
+
+
+@functools.cache
+def _sides(fov_deg: float, aspect: float) -> FloatArray:
+    """The planes through a camera around what it sees.
+
+    Args:
+        fov_deg: Its field of view, from bottom to top (deg).
+        aspect: Width of the picture by its height.
+
+    Returns:
+        Unit normals of its four sides, outward, and backward, in MuJoCo's camera frame, (3, 5).
+    """
+    slope = math.tan(0.5 * math.radians(fov_deg))
+    across = aspect * slope
+    normals = np.array(
+        [[1, 0, across], [-1, 0, across], [0, 1, slope], [0, -1, slope], [0, 0, 1]], np.float64
+    ).T
+    return normals / np.linalg.norm(normals, axis=0)
 
 
 def _free(context: gl.GLContext, mujoco_context: mujoco.MjrContext) -> None:

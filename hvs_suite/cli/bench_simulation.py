@@ -149,6 +149,8 @@ def run_once(env: "Environment", scenario: int) -> TimedEpisode:
 class BareLoop:
     """``mj_step`` and the observed pictures of the same compiled model, and nothing else.
 
+    Pictures are drawn as MuJoCo does by itself: with every visible geom, in view or not.
+
     Args:
         env: Reset at least once; only its compiled model and its cameras' sizes are used.
     """

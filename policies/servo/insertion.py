@@ -15,8 +15,7 @@ from hvs_suite.policies.servo.target_estimate import DISC_PLANE_M, Sight
 from hvs_suite.rollout import Observation
 from hvs_suite.tasks.insert import WRENCH, InsertSpec
 from hvs_suite.tasks.shared.feeling import HoleSearch, search_of
-from hvs_suite.tasks.shared.goal import HEIGHT, LATERAL, Goal
-from hvs_suite.tasks.shared.placing import UP
+from hvs_suite.tasks.shared.goal import HEIGHT, LATERAL, UP, Goal
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -26,8 +26,9 @@ from hvs_suite.policies.servo.still_target import StillTargetServo, within_reach
 from hvs_suite.rollout import Observation
 from hvs_suite.tasks.shared.detection import find_discs
 from hvs_suite.tasks.shared.goal import Goal
+from hvs_suite.tasks.shared.panels import OFF_CENTRE_M, SIDE_M
 from hvs_suite.tasks.shared.pattern_pose import Ring, axes
-from hvs_suite.tasks.surface import OFF_CENTRE_M, SIDE_M, SurfaceSpec
+from hvs_suite.tasks.surface import SurfaceSpec
 
 FloatArray = npt.NDArray[np.float64]
 

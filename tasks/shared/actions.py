@@ -58,14 +58,14 @@ def check_action(action: Any, mode: ActionMode, *, clip: bool) -> tuple[FloatArr
         raise ActionError(f"an action is {size} numbers in [-1, 1], not {action!r}") from error
     if values.shape != (size,):
         raise ActionError(f"an action of mode {mode} has shape ({size},), not {values.shape}")
-    # NaN fails this comparison too, so that the common case costs one.
-    largest = float(np.abs(values).max())
-    if largest <= 1.0:
+    # Plain floats cost a third of NumPy's here, in every control step. NaN fails this, too.
+    if all(-1.0 <= value <= 1.0 for value in values.tolist()):
         return values, False
     if not np.isfinite(values).all():
         bad = int(np.flatnonzero(~np.isfinite(values))[0])
         raise ActionError(f"action[{bad}] is {values[bad]}; actions are finite numbers in [-1, 1]")
     if not clip:
+        largest = float(np.abs(values).max())
         raise ActionError(
             f"an action value of {largest:.6g} lies outside [-1, 1]; clip it, or use the "
             "Gymnasium environment, which clips and counts"

@@ -449,11 +449,11 @@ class ArmTask(composer.Task):
 
     def joint_positions(self, physics: mjcf.Physics) -> FloatArray:
         """True joint angles, (7,) rad."""
-        return physics.data.ptr.qpos[self._qpos].copy()
+        return np.asarray(physics.data.ptr.qpos[self._qpos])
 
     def joint_velocities(self, physics: mjcf.Physics) -> FloatArray:
         """True joint speeds, (7,) rad/s."""
-        return physics.data.ptr.qvel[self._qvel].copy()
+        return np.asarray(physics.data.ptr.qvel[self._qvel])
 
     def flange_position(self, physics: mjcf.Physics) -> FloatArray:
         """True position of the flange face's centre, (3,) m, base frame."""
@@ -465,7 +465,7 @@ class ArmTask(composer.Task):
 
     def setpoint(self, physics: mjcf.Physics) -> FloatArray:
         """True joint set point that the controller tracks now, (7,) rad."""
-        return physics.data.ptr.act[self._act].copy()
+        return np.asarray(physics.data.ptr.act[self._act])
 
     def setpoint_velocity(self) -> FloatArray:
         """Speed of the set point in the last control step, (7,) rad/s."""

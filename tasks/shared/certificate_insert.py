@@ -13,8 +13,7 @@ from hvs_suite.cell.robot import JOINT_ACCELERATION_RAD_S2
 from hvs_suite.tasks.shared.certificate import MAX_BUDGET, Check
 from hvs_suite.tasks.shared.detection import find_disc, intersect, outline
 from hvs_suite.tasks.shared.feeling import HoleSearch, search_of
-from hvs_suite.tasks.shared.goal import Goal
-from hvs_suite.tasks.shared.placing import UP
+from hvs_suite.tasks.shared.goal import UP, Goal
 
 if TYPE_CHECKING:
     from hvs_suite.tasks.shared.environment import Environment

@@ -138,12 +138,13 @@ class Environment(composer.Environment):
         self._hooks.before_step(physics, action, self._random_state)
         model, data = self._physics.model.ptr, self._physics.data.ptr
         task = self._arm
-        collided = False
+        finish, begin = mujoco.mj_step2, mujoco.mj_step1
+        collided, touches = False, data.ncon
         for _ in range(self._n_sub_steps):
-            touched = data.ncon
-            mujoco.mj_step2(model, data)
-            mujoco.mj_step1(model, data)
-            if (touched or data.ncon) and task.is_forbidden(physics):
+            finish(model, data)
+            begin(model, data)
+            touched, touches = touches, data.ncon
+            if (touched or touches) and task.is_forbidden(physics):
                 collided = True
                 break
         self._control_steps += 1

@@ -22,7 +22,8 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.errors import OptionError, describe
-from hvs_suite.tasks.shared.goal import Goal, Keypoint, Tip
+from hvs_suite.tasks.shared.goal import UP, Goal, Keypoint, Tip
+from hvs_suite.tasks.shared.scenario import Scenario, Streams, draw_look
 from hvs_suite.tasks.shared.spec import Spec
 
 if TYPE_CHECKING:
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from hvs_suite.cell.surface import Surface
     from hvs_suite.tasks.shared.certificate import Check
     from hvs_suite.tasks.shared.environment import Environment
-    from hvs_suite.tasks.shared.scenario import Scenario, Streams
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -96,8 +96,26 @@ class Family[S: Spec, C: Scenario](abc.ABC):
         del physics
 
     @abc.abstractmethod
-    def draw(self, streams: "Streams") -> C:
+    def draw(self, streams: Streams) -> C:
         """Draw a scenario, as a pure function of its streams."""
+
+    def draw_common(
+        self,
+        streams: Streams,
+        goal: Goal,
+        floor_normal: FloatArray = UP,
+        solids: "tuple[Solid, ...]" = (),
+    ) -> dict[str, Any]:
+        """Draw start and look, to be passed on to a scenario; arguments as `start.draw_start`'s.
+
+        Returns:
+            The fields of `Scenario` itself, by name.
+        """
+        from hvs_suite.tasks.shared.start import draw_start
+
+        own = self.named.start if self.named is not None else "zero"
+        start = draw_start(self.spec, own, streams, goal, floor_normal, solids)
+        return {"start": start, **draw_look(self.spec, streams)}
 
     def begin(self, physics: "mjcf.Physics", scenario: C) -> None:
         """Put the scene into its state at the reset; nothing of earlier episodes remains."""

@@ -14,6 +14,8 @@ LATERAL = "lateral_error_mm"
 HEIGHT = "height_error_mm"
 TILT = "tilt_error_deg"
 """Names of what `goal_errors` measures."""
+UP: FloatArray = np.array([0.0, 0.0, 1.0])
+"""Outward normal of a level surface, base frame."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -1,6 +1,7 @@
 """Motions on the work surface: straight lines, and smooth curves that nobody can foresee."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import numpy as np
@@ -47,8 +48,13 @@ class Motion:
         return -self._waves(np.sin, np.asarray(time_s, np.float64)[..., None], 2)
 
     def _waves(self, wave: np.ufunc, time: FloatArray, derivative: int) -> FloatArray:
-        height: FloatArray = self.amplitude * self.omega**derivative
+        height = self._heights[derivative]
         return np.asarray((height * wave(self.omega * time[..., None] + self.phase)).sum(axis=-2))
+
+    @functools.cached_property
+    def _heights(self) -> tuple[FloatArray, ...]:
+        """Of the waves and their first two derivatives, (3, 2) each."""
+        return tuple(self.amplitude * self.omega**derivative for derivative in range(3))
 
 
 def draw_line(random: np.random.Generator, draw_place: DrawPlace, speed_m_s: float) -> Motion:

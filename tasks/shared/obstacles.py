@@ -6,21 +6,30 @@ there is room for all of its lane, the next near the target, the others anywhere
 
 import dataclasses
 import math
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from hvs_suite.cell.prop import Lane, Obstacle, Prop
-from hvs_suite.cell.solid import Solid
 from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared.goal import Goal
-from hvs_suite.tasks.shared.props import Placed
-from hvs_suite.tasks.shared.room import Room, draw_way
+from hvs_suite.tasks.shared.props import Placed, Props
+from hvs_suite.tasks.shared.spec import Spec, scene
+
+if TYPE_CHECKING:
+    from dm_control import mjcf
+
+    from hvs_suite.cell.prop import Obstacle, Prop
+    from hvs_suite.cell.solid import Solid
+    from hvs_suite.tasks.shared.room import Room
 
 FloatArray = npt.NDArray[np.float64]
 
 HEIGHT_M = 0.50
 """Of all obstacles in the model; a lower one is sunk into the table."""
+MAX_OBSTACLES = 6
+"""How many there are."""
 CARRIAGE, LANE, OVERHANG = "carriage", "lane", "overhang"
 LANE_M = 0.30
 """How far the carriage moves (m)."""
@@ -35,14 +44,49 @@ _MAX_TRIES = 200
 _WHITE, _SLATE, _WOOD = (0.93, 0.93, 0.90, 1.0), (0.30, 0.33, 0.38, 1.0), (0.55, 0.42, 0.28, 1.0)
 
 
-def _bank() -> list[Obstacle]:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ObstaclesSpec(Spec):
+    """Parameters of what stands around.
+
+    Attributes:
+        n_obstacles: Fewest and most obstacles.
+        obstacle_height_m: Least and largest height of an obstacle (m).
+        moves: Whether the first obstacle moves in mid-episode.
+        moves_at_s: When it begins, earliest and latest (s).
+        speed_m_s: How fast it moves, least and most (m/s).
+    """
+
+    n_obstacles: tuple[int, int] = scene((0, 0))
+    obstacle_height_m: tuple[float, float] = scene((0.10, 0.50))
+    moves: bool = scene(False)
+    moves_at_s: tuple[float, float] = scene((0.3, 1.5))
+    speed_m_s: tuple[float, float] = scene((0.10, 0.20))
+
+    def __post_init__(self) -> None:
+        """Refuse values that make no sense, with a sentence.
+
+        Raises:
+            OptionError: One of them does not.
+        """
+        super().__post_init__()
+        self._check_range("moves_at_s", "speed_m_s")
+        self._check_range("n_obstacles", most=MAX_OBSTACLES)
+        self._check_range("obstacle_height_m", least=0.05, most=HEIGHT_M)
+        if self.moves and not self.n_obstacles[0]:
+            raise OptionError("moves needs an obstacle that can move; raise n_obstacles")
+
+
+def _bank() -> "list[Obstacle]":
     """All that may stand there, at full height."""
+    from hvs_suite.cell.prop import Obstacle
+    from hvs_suite.cell.solid import Solid
+
     h = 0.5 * HEIGHT_M
 
-    def post(radius: float) -> Solid:
+    def post(radius: float) -> "Solid":
         return Solid("cylinder", (radius, radius, h), (0.0, 0.0, h))
 
-    def box(a: float, b: float) -> Solid:
+    def box(a: float, b: float) -> "Solid":
         return Solid("box", (a, b, h), (0.0, 0.0, h))
 
     beam = Solid("box", (0.16, 0.03, 0.02), (0.16, 0.0, HEIGHT_M - 0.02))
@@ -57,24 +101,23 @@ def _bank() -> list[Obstacle]:
 
 
 class Obstacles:
-    """The obstacles of a family, and how they are arranged.
+    """The obstacles of a family: how they are arranged, and where they are.
 
     Args:
-        count: Fewest and most of them in a scene; none is made where that is none.
-        height_m: Least and largest height (m).
-        moves: Whether the carriage is one of them, and moves.
+        spec: How many, and whether one moves; none is made where there is none in any scene.
     """
 
-    def __init__(
-        self, count: tuple[int, int], height_m: tuple[float, float], *, moves: bool
-    ) -> None:
-        self._count, self._height_m, self._moves = count, height_m, moves
-        self._by_name = {each.mjcf_model.model: each for each in (_bank() if count[1] else [])}
+    def __init__(self, spec: ObstaclesSpec) -> None:
+        self._spec = spec
+        bank = _bank() if spec.n_obstacles[1] else []
+        self._by_name = {each.mjcf_model.model: each for each in bank}
 
     @property
-    def props(self) -> list[Prop]:
+    def props(self) -> "list[Prop]":
         """Obstacles, and the lane of the one that moves."""
-        lane = [Lane(LANE, LANE_M, _LANE_WIDTH_M)] if self._moves else []
+        from hvs_suite.cell.prop import Lane
+
+        lane = [Lane(LANE, LANE_M, _LANE_WIDTH_M)] if self._spec.moves else []
         return [*lane, *self._by_name.values()]
 
     def draw(
@@ -93,8 +136,10 @@ class Obstacles:
         Raises:
             OptionError: There is no room for the fewest.
         """
-        low, high = self._count
-        moving = [CARRIAGE] * self._moves
+        from hvs_suite.tasks.shared.room import Room, draw_way
+
+        low, high = self._spec.n_obstacles
+        moving = [CARRIAGE] * self._spec.moves
         others = [name for name in self._by_name if name not in moving]
         for _ in range(_MAX_ARRANGEMENTS):
             way = draw_way(random, start, goal)
@@ -116,7 +161,7 @@ class Obstacles:
     def _find_room(
         self,
         random: np.random.Generator,
-        room: Room,
+        room: "Room",
         name: str,
         target: FloatArray,
         *,
@@ -136,7 +181,7 @@ class Obstacles:
         self, random: np.random.Generator, name: str, target: FloatArray, *, near: bool
     ) -> FloatArray:
         """Draw where an obstacle stands, (4,): near the target, or anywhere in reach."""
-        low, high = self._height_m
+        low, high = self._spec.obstacle_height_m
         yaw, away = random.uniform(-math.pi, math.pi, 2)
         if near:
             distance, middle = random.uniform(*_NEAR_M), target[:2]
@@ -150,11 +195,47 @@ class Obstacles:
             yaw = math.atan2(target[1] - y, target[0] - x) + _OVERHANG_TURN * yaw
         return np.array([x, y, random.uniform(low, high) - HEIGHT_M, yaw])
 
-    def is_one(self, placed: Placed) -> bool:
-        """Whether something that a scene put there is an obstacle."""
-        return placed.prop in self._by_name
+    def begin(
+        self,
+        physics: "mjcf.Physics",
+        props: Props,
+        placed: Iterable[Placed],
+        motion: FloatArray | None,
+    ) -> None:
+        """Begin an episode.
 
-    def solids(self, placed: Placed, way_m: float = 0.0) -> list[Solid]:
+        Args:
+            physics: The compiled cell.
+            props: All of the family, these among them, put where they belong.
+            placed: What is there, obstacles among other things.
+            motion: When the carriage begins to move (s), and its speed (m/s); None if it does not.
+        """
+        self._props, self._motion, self._way_m = props, motion, 0.0
+        self._standing = [each for each in placed if each.prop in self._by_name]
+        self._carriage = None
+        if motion is not None:
+            self._carriage = next((p for p in self._standing if p.prop == CARRIAGE), None)
+        if self._carriage is not None:
+            props.put(physics, Placed(LANE, np.array([1.0, 1.0, 0.0, 1.0]) * self._carriage.pose))
+        self.advance(physics, 0.0)
+
+    def advance(self, physics: "mjcf.Physics", time_s: float) -> None:
+        """Move the carriage to where it is at a time since the reset (s)."""
+        if self._motion is None or self._carriage is None:
+            return
+        begins_s, speed = self._motion
+        self._way_m = min(max(speed * (time_s - begins_s), 0.0), LANE_M)
+        self._props.put(physics, moved(self._carriage, self._way_m))
+
+    def present(self) -> "tuple[Solid, ...]":
+        """What all fill; the carriage with all its lane until it rests."""
+        solids: list[Solid] = []
+        for each in self._standing:
+            rests = each is self._carriage and self._way_m >= LANE_M
+            solids += self.solids(each, self._way_m if rests else 0.0)
+        return tuple(solids)
+
+    def solids(self, placed: Placed, way_m: float = 0.0) -> "list[Solid]":
         """What an obstacle fills; the carriage, all from where it has come to its lane's end.
 
         Args:
@@ -163,7 +244,7 @@ class Obstacles:
         """
         *place, yaw = placed.pose.tolist()
         solids = [solid.moved(place, yaw) for solid in self._by_name[placed.prop].solids]
-        if placed.prop != CARRIAGE or not self._moves:
+        if placed.prop != CARRIAGE or not self._spec.moves:
             return solids
         if way_m:
             ahead = moved(placed, way_m)

@@ -21,6 +21,7 @@ from hvs_suite.tasks.shared.goal import (
     LATERAL,
     POSITION,
     TILT,
+    UP,
     Goal,
     Keypoint,
     Tip,
@@ -38,8 +39,6 @@ if TYPE_CHECKING:
     from hvs_suite.tasks.shared.environment import Environment
 
 FloatArray = npt.NDArray[np.float64]
-
-UP: FloatArray = np.array([0.0, 0.0, 1.0])
 
 HARD: Mapping[str, Any] = MappingProxyType(
     {
@@ -79,7 +78,7 @@ class RingSpec(Spec):
             OptionError: One of them does not.
         """
         super().__post_init__()
-        self._check("must be positive", lambda value: value > 0, "target_diameter_m")
+        self._check_positive("target_diameter_m")
         if not 0.0 < self.ring_m[0] < self.ring_m[1]:
             raise OptionError(f"ring_m is {self.ring_m}; use an inner and a larger outer radius")
 
@@ -124,12 +123,7 @@ class PlacingSpec(RingSpec):
             OptionError: One of them does not.
         """
         super().__post_init__()
-        self._check(
-            "must be positive",
-            lambda value: value > 0,
-            "standoff_m",
-            "tilt_tolerance_deg",
-        )
+        self._check_positive("standoff_m", "tilt_tolerance_deg")
         for name in ("position_tolerance_mm", "lateral_tolerance_mm", "height_tolerance_mm"):
             value = getattr(self, name)
             if value is not None and not value > 0:

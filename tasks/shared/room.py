@@ -34,6 +34,7 @@ _BASE_RADIUS_M = 0.25
 _BASE_HEIGHT_M = 0.60
 _GAP_M = 0.02
 _STEP_RAD = 0.06
+_NOTHING_RAD = 1e-12
 _N_SWIVEL = 36
 _SAMPLES = 8
 
@@ -73,7 +74,10 @@ def draw_way(random: np.random.Generator, start: FloatArray, goal: Goal) -> Floa
         raised[6] = start[6]
         way = [*np.linspace(upright, raised, _SAMPLES)[1:], family[row]]
         if all(kinematics().clearance(q, goal.target[2]) >= LEAST_CLEARANCE_M for q in way):
-            return np.stack([upright, raised, family[row]])
+            found = np.stack([upright, raised, family[row]])
+            # What rounding leaves of a zero has the sign that the processor gives it.
+            found[np.abs(found) < _NOTHING_RAD] = 0.0
+            return found
     raise OptionError(
         f"no free way found to the goal at {goal.position.round(3).tolist()}; use other radii "
         "in ring_m"

@@ -120,6 +120,28 @@ class Streams:
         return np.random.Generator(np.random.Philox(key=self.key, counter=counter))
 
 
+class StepStream:
+    """The stream of one quantity at any control step, from one generator that is set to it.
+
+    To make a generator takes longer than to draw from it what a step needs.
+
+    Args:
+        source: Of the scenarios.
+        stream: Name of the quantity.
+    """
+
+    def __init__(self, source: "ScenarioSource", stream: str) -> None:
+        self._generator = source.generator(stream, 0)
+        self._state = self._generator.bit_generator.state
+
+    def at(self, index: int, step: int) -> np.random.Generator:
+        """As `ScenarioSource.generator`; draw from it before the next is asked for."""
+        counter = self._state["state"]["counter"]
+        counter[1], counter[3] = step, index
+        self._generator.bit_generator.state = self._state
+        return self._generator
+
+
 class ScenarioSource:
     """Draws the scenarios of one task, with its options, in one split.
 

@@ -8,6 +8,7 @@ means needs a new ``version``; ``tasks/lock.json`` holds the digests.
 
 import dataclasses
 import difflib
+import functools
 import math
 import typing
 from collections.abc import Iterable, Mapping
@@ -226,9 +227,7 @@ class Spec(Timing, Cameras, Disturbances):
         self._check_timing()
         if isinstance(self.start, tuple):
             _check_joints(self.start)
-        self._check(
-            "cannot be negative",
-            lambda value: value >= 0,
+        self._check_not_negative(
             "eth_position_noise_m",
             "eth_rotation_noise_deg",
             "image_noise",
@@ -253,7 +252,7 @@ class Spec(Timing, Cameras, Disturbances):
             raise OptionError("eth_position_m lies straight above eth_look_at_m; shift one of them")
 
     def _check_timing(self) -> None:
-        self._check("must be positive", lambda value: value > 0, "control_period_s")
+        self._check_positive("control_period_s")
         self._check("must be at most 1", lambda value: value <= 1.0, "control_period_s")
         for name in ("hold_steps", "time_limit_steps"):
             if getattr(self, name) < 1:
@@ -280,6 +279,26 @@ class Spec(Timing, Cameras, Disturbances):
             value = getattr(self, name)
             if not holds(value):
                 raise OptionError(f"{name} is {value}; it {rule}")
+
+    def _check_positive(self, *names: str) -> None:
+        self._check("must be positive", lambda value: value > 0, *names)
+
+    def _check_not_negative(self, *names: str) -> None:
+        self._check("cannot be negative", lambda value: value >= 0, *names)
+
+    def _check_range(self, *names: str, least: float = 0.0, most: float = math.inf) -> None:
+        """Hold fields that are a least and a largest value against bounds.
+
+        Raises:
+            OptionError: A field breaks them.
+        """
+        for name in names:
+            low, high = getattr(self, name)
+            if not least <= low <= high <= most:
+                bounds = f"{least:g} up" if most == math.inf else f"{least:g} to {most:g}"
+                raise OptionError(
+                    f"{name} is {(low, high)}; use a least and a larger value, from {bounds}"
+                )
 
     @property
     def metrics(self) -> tuple[Metric, ...]:
@@ -327,8 +346,8 @@ class Spec(Timing, Cameras, Disturbances):
         deciding = [m for m in bounded if m.over == "episode" and not m.is_limit] or bounded
         return {metric.name: metric.bound for metric in deciding if metric.bound is not None}
 
-    @property
-    def step_bounds(self) -> dict[str, float]:
+    @functools.cached_property
+    def step_bounds(self) -> Mapping[str, float]:
         """Bounds on the step metrics: a control step that ends inside all of them is held."""
         return {
             metric.name: metric.bound

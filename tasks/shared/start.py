@@ -9,7 +9,7 @@ from hvs_suite.cell.kinematics import Kinematics, kinematics, travel_time
 from hvs_suite.cell.robot import JOINT_NAMES, JOINT_RANGE_RAD
 from hvs_suite.cell.solid import Solid, obstacle_distance
 from hvs_suite.errors import OptionError
-from hvs_suite.tasks.shared.goal import Goal
+from hvs_suite.tasks.shared.goal import UP, Goal
 from hvs_suite.tasks.shared.scenario import Streams
 from hvs_suite.tasks.shared.spec import Spec, Start
 
@@ -32,7 +32,7 @@ def draw_start(
     own: Start,
     streams: Streams,
     goal: Goal,
-    floor_normal: FloatArray,
+    floor_normal: FloatArray = UP,
     solids: tuple[Solid, ...] = (),
 ) -> FloatArray:
     """Draw where the arm stands at reset.

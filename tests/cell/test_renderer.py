@@ -17,6 +17,7 @@ import pytest
 import hvs_suite
 from hvs_suite.cell import gl
 from hvs_suite.cell.renderer import Renderer
+from hvs_suite.cli.bench_simulation import BareLoop
 from hvs_suite.errors import RenderError
 from hvs_suite.tasks.shared.environment import Environment
 
@@ -152,6 +153,23 @@ def test_collision_bodies_are_never_drawn(named: Named) -> None:
     ids = env.renderer.segmentation(env.physics.data.ptr, env.task.cameras["eth"].id, 100, 100)
     drawn = {env.physics.model.id2name(int(i), "geom") for i in np.unique(ids) if i >= 0}
     assert not [name for name in drawn if "collision" in name]
+
+
+@pytest.mark.parametrize("task", ["align-thesis", "insert-wide", "surface-tilted"])
+def test_what_is_out_of_view_makes_no_difference(named: Named, task: str) -> None:
+    """Pictures are those of a loop that draws all there is, wherever the eye in the hand looks."""
+    env = named(task)
+    env.reset(scenario=0)
+    random = np.random.default_rng(0)
+    with contextlib.closing(BareLoop(env)) as loop:
+        for scenario in range(8):
+            seen = env.reset(scenario=scenario)
+            while not seen.last():
+                target = env.joint_positions + random.uniform(-0.3, 0.3, 7)
+                seen = env.step(env.commandable(target))
+                expected = loop.restore(env.moment().state)
+                for name, picture in zip(("eih", "eth"), expected, strict=True):
+                    np.testing.assert_array_equal(seen.observation[name], picture)
 
 
 def test_a_closed_renderer_says_so() -> None:

@@ -18,7 +18,7 @@ from hvs_suite.eval.serving.policy_session import Session
 from hvs_suite.eval.serving.remote_policy import hello
 from hvs_suite.gym import PixelsAgentPos, TaskEnv
 from hvs_suite.rollout import Observation, run_episode
-from hvs_suite.tasks.clutter import COLOURS
+from hvs_suite.tasks.shared.things import COLOURS
 
 TASK = "clutter-choice"
 SMALL: dict[str, Any] = {"eih_resolution": 16, "eth_resolution": 16}

@@ -11,10 +11,10 @@ import hvs_suite
 from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.cell.solid import Solid, arm_balls, obstacle_distance
 from hvs_suite.errors import OptionError
-from hvs_suite.tasks.clutter import COLOURS
 from hvs_suite.tasks.shared.certificate_room import find_by_outline
 from hvs_suite.tasks.shared.obstacles import LANE_M
 from hvs_suite.tasks.shared.room import straight
+from hvs_suite.tasks.shared.things import COLOURS
 
 OBSTACLES = "clutter-obstacles"
 
@@ -175,8 +175,12 @@ def test_a_swept_solid_holds_it_all_along_the_way() -> None:
         ("clutter-choice", {"colours": ("red", "pink")}, "'pink', which is none of red, blue"),
         ("clutter-choice", {"colours": ("red", "red")}, "each once"),
         ("clutter-choice", {"marker": "ring"}, "targets are discs"),
-        ("clutter-obstacles", {"n_obstacles": (2, 9)}, "use at most 6"),
-        ("clutter-obstacles", {"obstacle_height_m": (0.1, 0.9)}, "use heights from 0.05 to 0.5 m"),
+        ("clutter-obstacles", {"n_obstacles": (2, 9)}, "a least and a larger value, from 0 to 6"),
+        (
+            "clutter-obstacles",
+            {"obstacle_height_m": (0.1, 0.9)},
+            "a least and a larger value, from 0.05 to 0.5",
+        ),
         ("clutter-distractors", {"moves": True}, "an obstacle that can move"),
         ("clutter-distractors", {"observations": "eih+goal_colour"}, "unknown observation"),
     ],

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import mujoco
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -14,8 +15,7 @@ from hvs_suite.errors import OptionError
 from hvs_suite.rollout import run_episode
 from hvs_suite.tasks.insert import DEPTH, PEAK_FORCE, WRENCH
 from hvs_suite.tasks.shared.environment import Environment
-from hvs_suite.tasks.shared.goal import LATERAL, Tip
-from hvs_suite.tasks.shared.placing import UP
+from hvs_suite.tasks.shared.goal import LATERAL, UP, Tip
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -72,22 +72,43 @@ def press(hand: Hand, height_m: float) -> Any:
     return time_step
 
 
-def test_a_peg_on_the_face_rests_and_sinks_in_by_no_more_than_a_fiftieth_of_a_millimetre(
-    env: Environment,
+@pytest.mark.parametrize(("place", "n_at_rest"), [("face", 30), ("rim", 3)])
+@pytest.mark.parametrize("task", TASKS)
+def test_a_peg_held_against_face_or_rim_stays_at_rest_and_gains_no_energy(
+    task: str, place: str, n_at_rest: int
 ) -> None:
-    hand = Hand(env, 0.008)
-    press(hand, -0.003)
-    before = hand.tip()
-    deepest = 0.0
-    for _ in range(100 if env.spec.time_limit_steps > 150 else 30):
-        if env.task.has_ended:
-            break
-        hand.to(-0.003)
-        deepest = min([deepest, *env.physics.data.contact.dist])
-        assert np.linalg.norm(hand.tip() - before) < 0.00001
-    assert env.physics.data.ncon
-    assert -MAX_PENETRATION_M < deepest < 0.0
-    assert not env.info["collision"]
+    """At rest: to 0.01 mm for 100 steps of the physics (0.21 s), which 3 control steps hold.
+
+    It is held for 100 control steps (10 s), longer than any episode presses. Over so long a time
+    MuJoCo's soft friction lets a peg at the brink of slipping creep by more, but by less than
+    0.1 mm; docs/experiments/insertion.md has the figures and the reason.
+    """
+    with hvs_suite.load(task, split="test", observations=BLIND, time_limit_steps=150) as env:
+        env.draws = False
+        catch_m = 0.001 * (env.spec.clearance_mm + env.spec.chamfer_mm)
+        hand = Hand(env, 0.008 if place == "face" else catch_m + 0.001)
+        press(hand, -0.003)
+        start, energy = hand.tip(), energy_j(env)
+        deepest, stay = 0.0, env.commandable(hand.set_point)
+        for step in range(100):
+            env.step(stay)
+            deepest = min([deepest, *env.physics.data.contact.dist])
+            moved = float(np.linalg.norm(hand.tip() - start))
+            assert moved < (0.00001 if step < n_at_rest else 0.0001)
+            before, energy = energy, energy_j(env)
+            # Where contacts come and go it rises by what the solver leaves: of 14 mJ, 0.4 uJ.
+            assert energy < before + 1e-6
+        assert env.physics.data.ncon
+        assert -MAX_PENETRATION_M < deepest < 0.0
+        assert not env.info["collision"]
+
+
+def energy_j(env: Environment) -> float:
+    """What the joints' springs and the moving arm hold (J); its weight is made up for."""
+    model, data = env.physics.model.ptr, env.physics.data.ptr
+    mujoco.mj_energyVel(model, data)
+    lead = env.setpoint - env.joint_positions
+    return float(0.5 * model.actuator_gainprm[:, 0] @ lead**2 + data.energy[1])
 
 
 @pytest.mark.parametrize("share", [0.0, 0.9])
@@ -157,7 +178,7 @@ def test_the_hidden_error_is_in_no_observation_and_not_in_the_pictures() -> None
         assert 0.00035 < np.std(everywhere) < 0.0005
     with hvs_suite.load("insert-feel", split="test", force_limit_n=39.0) as env:
         other = env.reset(scenario=3)
-        hole = env.task.family._mocaps[1]
+        hole = env.task.family._peg._mocaps[1]
         env.physics.data.mocap_pos[hole] += [0.0005, -0.0005, 0.0]
         [moved] = env.pictures([env.moment()])["eih"]
         np.testing.assert_array_equal(moved, other.observation["eih"])

@@ -10,6 +10,7 @@ import pytest
 import hvs_suite
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
 from hvs_suite.tasks.shared.environment import Environment
+from hvs_suite.tasks.shared.observations import NoiseBank
 
 Named = Callable[..., Environment]
 PRIVILEGED = {"flange_position", "goal_position", "goal_normal", "target_position", "joint_offset"}
@@ -167,6 +168,19 @@ def test_image_noise_has_the_asked_strength_and_is_its_scene_s_own() -> None:
         other = env.reset(scenario=1).observation
         assert (other["eih"] != first["eih"]).any()
         np.testing.assert_array_equal(env.reset(scenario=0).observation["eih"], first["eih"])
+
+
+@pytest.mark.parametrize("sigma", [4.0, 100.0])
+def test_noise_of_any_strength_is_added_and_cut_to_the_range_of_a_pixel(sigma: float) -> None:
+    bank = NoiseBank(sigma)
+    black, grey, white = (np.full((64, 64, 3), level, np.uint8) for level in (0, 100, 255))
+    for image in (black, grey, white):
+        bank.disturb(image, np.random.default_rng(0))
+    # Black shows what noise adds, white what it takes away.
+    noise = black.astype(int) + (white.astype(int) - 255)
+    np.testing.assert_array_equal(grey, np.clip(100 + noise, 0, 255))
+    assert (noise > 0).any()
+    assert (noise < 0).any()
 
 
 def test_depth_comes_beside_the_other_observations_on_request() -> None:

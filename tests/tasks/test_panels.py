@@ -28,7 +28,7 @@ def test_target_and_marks_lie_on_a_panel_that_stands_on_the_table(task: str) -> 
         tilts, panels = [], set()
         for index in range(20):
             scene = env.task.source.draw(index)
-            panel = family._panels[scene.panel]
+            panel = family._panels.panels[scene.panel]
             radius = 1.0 / panel.curvature if panel.curvature else math.inf
             away = scene.marks - scene.target
             # On the skin, on the ring around the target, and no farther below the plane that
@@ -55,15 +55,13 @@ def test_target_and_marks_lie_on_a_panel_that_stands_on_the_table(task: str) -> 
 
 def test_one_panel_is_seen_and_it_looks_as_the_scene_says() -> None:
     with hvs_suite.load(CURVED, split="test", observations="state", vary_colour=True) as env:
-        family = env.task.family
+        geoms = env.task.family._panels.geoms
         for index in (0, 3):
             env.reset(scenario=index)
             camera = env.task.cameras["eth"]
             shown = np.unique(env.renderer.segmentation(env.physics.data.ptr, camera.id, 300, 300))
-            assert set(shown) & set(family._panel_geoms) == {
-                family._panel_geoms[env.scenario.panel]
-            }
-            colour = env.physics.model.ptr.geom_rgba[family._panel_geoms[env.scenario.panel], :3]
+            assert set(shown) & set(geoms) == {geoms[env.scenario.panel]}
+            colour = env.physics.model.ptr.geom_rgba[geoms[env.scenario.panel], :3]
             np.testing.assert_allclose(colour, env.scenario.panel_rgb, rtol=1e-6)
 
 
@@ -184,12 +182,12 @@ def test_noisy_depth_is_the_same_whenever_a_scene_is_played_and_true_depth_is_le
     ("task", "options", "reason"),
     [
         ("surface-tilted", {"marker": "fiducial"}, "targets are discs"),
-        ("surface-tilted", {"tilt_deg": (0.0, 40.0)}, "a larger up to 20"),
-        ("surface-tilted", {"raise_m": (0.1, 0.05)}, "a larger up to 0.15"),
+        ("surface-tilted", {"tilt_deg": (0.0, 40.0)}, "a least and a larger value, from 0 to 20"),
+        ("surface-tilted", {"raise_m": (0.1, 0.05)}, "from 0 to 0.15"),
         ("surface-tilted", {"ring_m": (0.4, 0.78)}, "the arm cannot face a panel that leans by"),
         ("surface-tilted", {"n_marks": 2}, "fewer show no slope"),
         ("surface-tilted", {"start": "fixed"}, "where some panel would stand"),
-        (CURVED, {"radius_m": (0.1, 2.0)}, "use a least from 0.5 m"),
+        (CURVED, {"radius_m": (0.1, 2.0)}, "from 0.5 up"),
         (CURVED, {"mark_ring_m": 0.008}, "the marks overlap the target"),
         (CURVED, {"mark_ring_m": 0.09}, "the marks leave the panel"),
         (CURVED, {"n_marks": 24, "mark_diameter_m": 0.006}, "so many overlap"),

@@ -17,7 +17,7 @@ from hvs_suite.errors import OptionError, ScenarioError
 from hvs_suite.registry import make_task
 from hvs_suite.tasks.align import fixed_places
 from hvs_suite.tasks.shared.environment import Environment
-from hvs_suite.tasks.shared.scenario import ScenarioSource
+from hvs_suite.tasks.shared.scenario import ScenarioSource, StepStream
 from hvs_suite.tasks.shared.start import steps_lower_bound
 
 Named = Callable[..., Environment]
@@ -41,6 +41,14 @@ def test_a_scenario_depends_on_its_index_and_on_no_other_draw(task: str) -> None
     assert digests(backward, [37, 37, 37]) == [expected[3]] * 3
     forward.generator("noise-eih", 37, 4).random(1000)
     assert digests(forward, [37]) == [expected[3]]
+
+
+def test_a_stream_that_is_set_to_a_step_draws_as_one_made_for_it() -> None:
+    draws = source("align-hard")
+    stream = StepStream(draws, "noise-eth")
+    for index, step in ((3, 0), (3, 7), (0, 7), (999, 39), (3, 7)):
+        expected = draws.generator("noise-eth", index, step).integers(1000, size=5)
+        np.testing.assert_array_equal(stream.at(index, step).integers(1000, size=5), expected)
 
 
 @pytest.mark.each_task

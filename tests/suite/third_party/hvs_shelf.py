@@ -14,11 +14,10 @@ from hvs_suite.cell.arena import Cell
 from hvs_suite.cell.robot import SCENE_BIT
 from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared.family import register
-from hvs_suite.tasks.shared.goal import Goal
-from hvs_suite.tasks.shared.placing import UP, Placing, PlacingSpec
-from hvs_suite.tasks.shared.scenario import Scenario, Streams, draw_look
+from hvs_suite.tasks.shared.goal import UP, Goal
+from hvs_suite.tasks.shared.placing import Placing, PlacingSpec
+from hvs_suite.tasks.shared.scenario import Scenario, Streams
 from hvs_suite.tasks.shared.spec import scene
-from hvs_suite.tasks.shared.start import draw_start
 
 HALF_SIDE_M = 0.04
 
@@ -82,9 +81,7 @@ class Shelf(Placing[ShelfSpec, ShelfScenario]):
         x, y = self.draw_on_ring(streams.generator("target"))
         target = np.array([x, y, streams.generator("height").uniform(*self.spec.height_m)])
         goal = Goal(target, UP, self.spec.standoff_m)
-        own = self.named.start if self.named is not None else "zero"
-        start = draw_start(self.spec, own, streams, goal, UP)
-        return ShelfScenario(target=target, start=start, **draw_look(self.spec, streams))
+        return ShelfScenario(target=target, **self.draw_common(streams, goal))
 
     def begin(self, physics: mjcf.Physics, scenario: ShelfScenario) -> None:
         """Put the block up, and the marker on it."""
