@@ -14,7 +14,7 @@ from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.cell.robot import JOINT_RANGE_RAD
 from hvs_suite.cell.surface import Surface
 from hvs_suite.errors import OptionError, ScenarioError
-from hvs_suite.registry import make_task
+from hvs_suite.registry import find, make_task
 from hvs_suite.tasks.align import fixed_places
 from hvs_suite.tasks.shared.environment import Environment
 from hvs_suite.tasks.shared.scenario import ScenarioSource, StepStream
@@ -63,7 +63,7 @@ def test_options_that_do_not_shape_the_scene_leave_it_alone(task: str) -> None:
         {"tilt_tolerance_deg": 3.0},
         {"discount": 0.9, "time_limit": "hard"},
         {"eth_position_m": (-1.0, 0.7, 2.5), "eih_fov_deg": 65.0},
-        {"target_diameter_m": 0.03},
+        {"target_diameter_m": 0.9 * find(task).target_diameter_m},
         {"acceleration_limits": True},
     ):
         assert digests(source(task, **options), [0, 5]) == expected, options
