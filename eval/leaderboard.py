@@ -17,8 +17,9 @@ from pathlib import Path
 from hvs_suite import files
 from hvs_suite.errors import HvsError, OptionError
 from hvs_suite.eval.board import clips, replay_check, rerun_check, submission
+from hvs_suite.eval.board.markdown import markdown
 from hvs_suite.eval.board.page import page
-from hvs_suite.eval.board.tables import make_entries, markdown
+from hvs_suite.eval.board.tables import make_entries
 from hvs_suite.names import shown
 
 RESULTS = Path("eval/results")
