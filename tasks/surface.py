@@ -24,9 +24,11 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.errors import OptionError
+from hvs_suite.tasks.shared import robustness
 from hvs_suite.tasks.shared.family import register
 from hvs_suite.tasks.shared.goal import Goal
 from hvs_suite.tasks.shared.placing import HARD, UP, Placing, PlacingSpec, is_reachable
+from hvs_suite.tasks.shared.robustness import Axis
 from hvs_suite.tasks.shared.scenario import Scenario, Streams, draw_look
 from hvs_suite.tasks.shared.spec import Description, scene
 
@@ -117,6 +119,10 @@ class SurfaceSpec(PlacingSpec):
         if self.radius_m is None:
             return 0.0
         return 0.25 * self.mark_ring_m**2 * 0.5 * sum(1.0 / radius for radius in self.radius_m)
+
+    def robustness_axes(self) -> tuple[Axis, ...]:
+        """The target is always a disc, which may have another paint."""
+        return robustness.replaced(super().robustness_axes(), robustness.target_hue())
 
     def describe(self) -> Description:
         """The task in words."""

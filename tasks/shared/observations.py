@@ -12,6 +12,7 @@ import numpy.typing as npt
 from dm_control import mjcf
 from dm_control.composer.observation import observable
 from dm_env import specs
+from scipy.ndimage import gaussian_filter
 
 from hvs_suite.cell import cameras
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
@@ -92,6 +93,9 @@ def _picture(task: "ArmTask", name: str, bank: npt.NDArray[np.int16] | None) -> 
         image = task.environment.renderer.colour(
             physics.data.ptr, task.cameras[name].id, side, side
         )
+        if spec.image_blur_px > 0:
+            # The lens comes before the sensor's noise.
+            image = gaussian_filter(image, (spec.image_blur_px, spec.image_blur_px, 0.0))
         if bank is not None:
             random = task.source.generator(
                 f"noise-{name}", task.scenario.index, task.environment.control_steps
@@ -104,12 +108,12 @@ def _picture(task: "ArmTask", name: str, bank: npt.NDArray[np.int16] | None) -> 
         return image.astype(np.float32) / np.float32(255) if normalise else image
 
     shape = (side, side, channels)
-    spec = (
+    array = (
         specs.BoundedArray(shape, np.float32, 0.0, 1.0)
         if normalise
         else specs.BoundedArray(shape, np.uint8, 0, 255)
     )
-    return cameras.CameraImage(take, spec)
+    return cameras.CameraImage(take, array)
 
 
 def _depth(task: "ArmTask", name: str) -> Any:
