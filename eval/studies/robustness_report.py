@@ -18,7 +18,8 @@ _SPREAD = 0.08
 def rows(study: Robustness) -> list[tuple[str, ...]]:
     """The table: an axis a row, success with its interval for each strength.
 
-    A star marks what differs from the undisturbed scenes, at 5 % for all cells together.
+    A star marks what differs from the undisturbed scenes: McNemar's exact test with Holm's
+    correction, at 5 % for all cells together.
     """
     significant = study.significant()
     table: list[tuple[str, ...]] = [("undisturbed", _rate(study.undisturbed), "", "", "")]
@@ -36,8 +37,8 @@ def rows(study: Robustness) -> list[tuple[str, ...]]:
 def title(study: Robustness) -> str:
     """What the table shows, in one line."""
     return (
-        f"{study.policy} on {study.task}: success (95 % interval) in {study.episodes} scenes of "
-        f"split {study.split}; * differs from undisturbed (McNemar with Holm's correction, 5 %)"
+        f"{study.policy} on {study.task}, {study.episodes} scenes of split {study.split}: success "
+        "(95 % interval), * if not that of the undisturbed"
     )
 
 

@@ -157,19 +157,19 @@ def unseen_marker() -> Axis:
     return Axis(
         "marker",
         "unseen marker",
-        "another paint (telemagenta, RAL 4010), a ring, and a black and white fiducial",
-        ("hue -30°", "ring", "fiducial"),
-        (_options(target_hue_deg=-30.0), _options(marker="ring"), _options(marker="fiducial")),
+        "another outline, another paint (telemagenta, RAL 4010), and a black and white fiducial",
+        ("ring", "hue -30°", "fiducial"),
+        (_options(marker="ring"), _options(target_hue_deg=-30.0), _options(marker="fiducial")),
     )
 
 
 def target_hue() -> Axis:
     """A target of another paint."""
-    turns_deg = (-30.0, -60.0, -90.0)
+    turns_deg = (-15.0, -30.0, -60.0)
     return Axis(
         "marker",
         "unseen marker",
-        "other paints: telemagenta (RAL 4010), purple and violet",
+        "other paints: raspberry red (RAL 3027), telemagenta (RAL 4010) and purple",
         tuple(f"hue {turn:g}°" for turn in turns_deg),
         tuple(_options(target_hue_deg=turn) for turn in turns_deg),
     )
