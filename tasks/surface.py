@@ -29,7 +29,7 @@ from hvs_suite.tasks.shared.family import register
 from hvs_suite.tasks.shared.goal import Goal
 from hvs_suite.tasks.shared.placing import HARD, UP, Placing, PlacingSpec, is_reachable
 from hvs_suite.tasks.shared.robustness import Axis
-from hvs_suite.tasks.shared.scenario import Scenario, Streams, draw_look
+from hvs_suite.tasks.shared.scenario import Scenario, Streams, draw_look, towards
 from hvs_suite.tasks.shared.spec import Description, scene
 
 if TYPE_CHECKING:
@@ -275,10 +275,11 @@ class Surface(Placing[SurfaceSpec, SurfaceScenario]):
 
     def _draw_paint(self, streams: Streams) -> FloatArray:
         """Colour of the panel: primer, or anything pale where colours vary."""
-        random = streams.generator("paint")
+        random, primer = streams.generator("paint"), np.array([0.70, 0.72, 0.66])
         if not self.spec.vary_colour:
-            return np.array([0.70, 0.72, 0.66])
-        return np.asarray(np.clip(random.uniform(0.4, 0.9) + random.uniform(-0.08, 0.08, 3), 0, 1))
+            return primer
+        paint = np.clip(random.uniform(0.4, 0.9) + random.uniform(-0.08, 0.08, 3), 0, 1)
+        return np.asarray(np.clip(towards(primer, paint, self.spec.colour_strength), 0, 1))
 
     def after_compile(self, physics: "mjcf.Physics") -> None:
         """Look up target, marks and panels in the compiled model."""

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from hvs_suite.cell.arena import Cell
 from hvs_suite.cell.surface import TEXTURE_SIDE_PX
-from hvs_suite.tasks.shared.scenario import Scenario
+from hvs_suite.tasks.shared.scenario import Scenario, towards
 from hvs_suite.tasks.shared.spec import Disturbances
 
 FloatArray = npt.NDArray[np.float64]
@@ -63,25 +63,25 @@ class Appearance:
         model, spec = physics.model.ptr, self._spec
         for name, value in self._defaults.items():
             getattr(model, name)[:] = value
-        diffuse, ambient = _towards(np.ones(2), scenario.light_level, spec.light_strength)
+        diffuse, ambient = towards(np.ones(2), scenario.light_level, spec.light_strength)
         model.light_diffuse[self._light] *= diffuse
         model.vis.headlight.ambient[:] = self._ambient * ambient
         if scenario.light_direction is not None:
             own = model.light_dir[self._light].copy()
-            direction = _towards(own, scenario.light_direction, spec.light_strength)
+            direction = towards(own, scenario.light_direction, spec.light_strength)
             model.light_dir[self._light] = direction
         for materials, rgb in (
             ([self._surface], scenario.surface_rgb),
             (self._targets, scenario.target_rgb),
         ):
             if rgb is not None:
-                towards = _towards(model.mat_rgba[materials, :3], rgb, spec.colour_strength)
-                model.mat_rgba[materials, :3] = np.clip(towards, 0.0, 1.0)
+                rgb_there = towards(model.mat_rgba[materials, :3], rgb, spec.colour_strength)
+                model.mat_rgba[materials, :3] = np.clip(rgb_there, 0.0, 1.0)
         if spec.target_hue_deg:
             for material in self._targets:
                 own = model.mat_rgba[material, :3]
                 model.mat_rgba[material, :3] = _turned(own, spec.target_hue_deg)
-        self._tint_robot(model, _towards(np.ones(3), scenario.robot_tint, spec.colour_strength))
+        self._tint_robot(model, towards(np.ones(3), scenario.robot_tint, spec.colour_strength))
         _displace(model, self._eth, scenario.eth_shift, scenario.eth_turn)
         if scenario.eih_shift is not None and scenario.eih_turn is not None:
             _displace(model, self._eih, scenario.eih_shift, scenario.eih_turn)
@@ -117,11 +117,6 @@ def _displace(model: Any, camera: int, shift: FloatArray, turn: FloatArray) -> N
     model.cam_quat[camera] = turned.as_quat(scalar_first=True)
 
 
-def _towards(own: FloatArray, drawn: FloatArray, strength: float) -> FloatArray:
-    """From one value towards another, which strength 1 reaches to the last bit."""
-    return np.asarray((1.0 - strength) * own + strength * drawn, np.float64)
-
-
 def _turned(rgb: FloatArray, hue_deg: float) -> tuple[float, float, float]:
     """A colour with its hue turned."""
     hue, saturation, value = colorsys.rgb_to_hsv(*rgb.tolist())
@@ -131,7 +126,7 @@ def _turned(rgb: FloatArray, hue_deg: float) -> tuple[float, float, float]:
 def _weakened(texture: npt.NDArray[np.uint8], strength: float) -> npt.NDArray[np.uint8]:
     """A texture as deep as the strength says; 1 leaves it as it is."""
     white = np.full(texture.shape, 255.0)
-    return np.clip(_towards(white, texture.astype(np.float64), strength), 0, 255).astype(np.uint8)
+    return np.clip(towards(white, texture.astype(np.float64), strength), 0, 255).astype(np.uint8)
 
 
 def surface_texture(seed: int) -> npt.NDArray[np.uint8]:

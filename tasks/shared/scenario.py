@@ -211,6 +211,11 @@ class ScenarioSource:
         return self._draw(self.streams(self.check(index)))
 
 
+def towards(own: FloatArray, drawn: FloatArray, strength: float) -> FloatArray:
+    """From one value towards another, which strength 1 reaches to the last bit."""
+    return np.asarray((1.0 - strength) * own + strength * drawn, np.float64)
+
+
 def draw_look(spec: Spec, streams: Streams) -> dict[str, Any]:
     """Draw what every scene has: the fields of `Look`, to be passed on to a scenario."""
     # A measured disturbance is normal, cut at two sigma: redrawing keeps the shape inside.
