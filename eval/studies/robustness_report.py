@@ -1,6 +1,7 @@
 """Table and picture of a robustness study."""
 
 import math
+import textwrap
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,8 +10,9 @@ from hvs_suite.tasks.shared.robustness import STRENGTHS
 
 COLOURS = ("#2b6cb0", "#e9620a", "#2f855a", "#7a3fa0", "#b7791f", "#4a5568")
 """Of the policies, in the order in which they are given."""
-COLUMNS = ("axis", *STRENGTHS, "what they are")
-_PANELS_A_ROW = 4
+COLUMNS = ("axis", *STRENGTHS, "strengths")
+_PANELS_A_ROW = 5
+_TICK_CHARACTERS = 10
 _SPREAD = 0.08
 """By how much the points of several policies are set apart, in strengths."""
 
@@ -64,7 +66,7 @@ def draw(studies: Sequence[Robustness]) -> Any:
     axes = studies[0].axes()
     n_rows = max(1, math.ceil(len(axes) / _PANELS_A_ROW))
     figure = Figure(
-        figsize=(2.7 * _PANELS_A_ROW, 2.15 * n_rows + 0.7),
+        figsize=(2.45 * _PANELS_A_ROW, 2.15 * n_rows + 0.5),
         dpi=130,
         facecolor="white",
         layout="constrained",
@@ -79,7 +81,7 @@ def draw(studies: Sequence[Robustness]) -> Any:
             offset = _SPREAD * (number - 0.5 * (len(studies) - 1))
             _draw_line(panel, found, offset, COLOURS[number % len(COLOURS)], study.policy)
         panel.set_title(cells[0].title, fontsize=9, loc="left")
-        ticks = ["as named", *(cell.level.replace(", ", ",\n") for cell in cells)]
+        ticks = ["as named", *(textwrap.fill(cell.level, _TICK_CHARACTERS) for cell in cells)]
         panel.set_xticks(range(len(ticks)), ticks, fontsize=6.5)
         panel.set_xlim(-0.3, len(STRENGTHS) + 0.3)
         panel.set_ylim(-3, 103)

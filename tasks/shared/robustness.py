@@ -182,7 +182,7 @@ def _look(name: str, title: str, anchor: str, own: float) -> Axis:
         _options(**{f"vary_{name}": True, f"{name}_strength": _together(own, share)})
         for share in shares
     )
-    return Axis(name, title, anchor, tuple(f"{share:g} x hard" for share in shares), options)
+    return Axis(name, title, anchor, tuple(f"{share:g} × hard" for share in shares), options)
 
 
 def _pose(
