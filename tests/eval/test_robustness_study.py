@@ -107,7 +107,9 @@ def test_what_came_with_the_suite_is_whole() -> None:
     for study in robustness_file.load_all():
         path = robustness_file.COMMITTED / study.policy / f"{study.task}.json"
         assert path.is_file()
-        assert len(study.axes()) + len(study.missing) == len(chosen_axes(study.task))
+        axes = {axis.name: axis for axis in chosen_axes(study.task)}
+        for name, cells in study.axes().items():
+            assert tuple(cell.level for cell in cells) == axes[name].levels
 
 
 def test_the_picture_has_a_panel_an_axis_and_a_line_a_policy(
