@@ -66,6 +66,8 @@ const look = () => {
   }
   for (const family of document.querySelectorAll(".family"))
     toggle(family, anyLeft(family.querySelector("tbody")));
+  for (const study of document.querySelectorAll(".study"))
+    toggle(study, JSON.parse(study.dataset.policies).some(policy => fits(policy, study.dataset.task)));
   const count = parts =>
     `${parts.filter(part => !part.classList.contains("gone")).length} of ${parts.length}`;
   const rows = [...document.querySelectorAll("#all-families [data-policy]")];

@@ -13,10 +13,11 @@ from typing import Final
 import jinja2
 from markdown_it import MarkdownIt
 
-from hvs_suite.eval.board import entry_sheet, families, matrix, means, plots, tables
+from hvs_suite.eval.board import entry_sheet, families, matrix, means, plots, robustness, tables
 from hvs_suite.eval.board.clips import SIZE, Clip
 from hvs_suite.eval.board.entry_sheet import Film
 from hvs_suite.eval.board.tables import SUCCESS, VERIFIED, Entry
+from hvs_suite.eval.scoring.robustness_file import Robustness
 from hvs_suite.names import shown
 
 COLOURS: Final = 8
@@ -28,6 +29,7 @@ def page(
     entries: Sequence[Entry],
     clips: Mapping[tuple[str, str], Sequence[Clip]] | None = None,
     *,
+    studies: Sequence[Robustness] = (),
     draft: bool = False,
 ) -> str:
     """Returns the whole page; the same entries and clips give the same text.
@@ -35,6 +37,7 @@ def page(
     Args:
         entries: One or more.
         clips: By (policy, task without version); none by default.
+        studies: Of robustness; none by default.
         draft: Say that it is one.
     """
     by_task = tables.by_task(entries)
@@ -65,6 +68,8 @@ def page(
                 for entry in table
             ],
             reel=reel,
+            studies=robustness.studies(studies),
+            robustness_note=robustness.NOTE,
             # Those on the most tasks come first, and have a colour of their own.
             colours={row.policy: k for k, row in enumerate(standings)},
         )
