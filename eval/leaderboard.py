@@ -17,12 +17,16 @@ from pathlib import Path
 from hvs_suite import files
 from hvs_suite.errors import HvsError, OptionError
 from hvs_suite.eval.board import clips, replay_check, rerun_check, submission
+from hvs_suite.eval.board.markdown import markdown
 from hvs_suite.eval.board.page import page
-from hvs_suite.eval.board.tables import make_entries, markdown
+from hvs_suite.eval.board.tables import make_entries
+from hvs_suite.eval.scoring import robustness_file
 from hvs_suite.names import shown
 
 RESULTS = Path("eval/results")
 OUT = Path("eval")
+ROBUSTNESS = "robustness"
+"""Name of the folder of studies beside the results."""
 
 
 def build(
@@ -38,7 +42,8 @@ def build(
     """Writes ``LEADERBOARD.md`` and ``leaderboard.html``, and the clips beside them.
 
     Args:
-        results_folder: Holds ``<policy>/<task>.json``.
+        results_folder: Holds ``<policy>/<task>.json``. Studies of robustness lie likewise in the
+            folder ``robustness`` beside it, as far as there are any.
         out: Folder to write to; made if missing.
         replay: Scenarios of each new result to play again, drawn anew; a number that a result does
             not have plays all of it.
@@ -52,7 +57,8 @@ def build(
         The two files.
 
     Raises:
-        ResultError: A result is refused, or there is none; the board stays as it was.
+        ResultError: A result is refused, or there is none, or a study of robustness is none; the
+            board stays as it was.
         OptionError: `replay` is below 1, or the ledger lies among the results.
         OutputError: A file cannot be written.
         RenderError: A clip is to be drawn and nothing here can.
@@ -68,7 +74,8 @@ def build(
     rerun = {} if reruns is None else rerun_check.check(submissions, reruns)
     entries = make_entries(submissions, replays, rerun)
     films = clips.clips(submissions, out / clips.FOLDER, say)
-    texts = markdown(entries, draft=draft), page(entries, films, draft=draft)
+    studies = robustness_file.load_all(results_folder.with_name(ROBUSTNESS))
+    texts = markdown(entries, draft=draft), page(entries, films, studies=studies, draft=draft)
     for path, text in zip(written, texts, strict=True):
         with files.replacing(path) as temporary:
             temporary.write_text(text, encoding="utf-8", newline="\n")

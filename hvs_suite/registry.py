@@ -85,6 +85,21 @@ def options_of(spec: Spec) -> dict[str, Any]:
     return found
 
 
+def announced(spec: Spec) -> Spec:
+    """What policies are told of a task that they play.
+
+    Args:
+        spec: Parameters, of a named task or changed from one.
+
+    Returns:
+        The same, or where the changes come unannounced, the named task's.
+
+    Raises:
+        UnknownTaskError: The spec's name is not registered.
+    """
+    return find(spec.name) if spec.unannounced else spec
+
+
 def family_of(name: str) -> type[family.Family[Any, Any]]:
     """The class that plays a named task.
 

@@ -11,7 +11,7 @@ from hvs_suite.errors import PolicyError
 from hvs_suite.policies import imported
 from hvs_suite.policies.checkpoints import hub
 from hvs_suite.policies.recipe import trained_on
-from hvs_suite.registry import find
+from hvs_suite.registry import announced, find
 from hvs_suite.rollout import PolicyFactory
 from hvs_suite.tasks.shared.spec import Spec
 
@@ -43,7 +43,7 @@ def policy_factory(spec: str, task: str, options: Mapping[str, Any] = AS_NAMED) 
         UnknownTaskError: There is no such task.
         OptionError: An option does not exist or its value makes no sense.
     """
-    played = find(task).with_options(options)
+    played = announced(find(task).with_options(options))
     if spec in BUILTIN:
         return _builtin(spec)
     if imported.NAME.fullmatch(spec):

@@ -8,6 +8,7 @@ nothing that only training may see.
 import dataclasses
 from typing import Any, Self
 
+from hvs_suite.registry import announced
 from hvs_suite.rollout import Policy, PolicyFactory
 from hvs_suite.tasks.shared.spec import Spec
 
@@ -17,7 +18,7 @@ class PolicyContext:
     """The public side of a task.
 
     Attributes:
-        spec: Parameters of the task; camera poses are nominal.
+        spec: Parameters of the task as they were announced; camera poses are nominal.
         observations: Shape, type and bounds of each observation, by name.
         action: Shape and bounds of an action.
         period_s: Control period (s).
@@ -32,7 +33,7 @@ class PolicyContext:
     def of(cls, env: Any) -> Self:
         """Returns what may be known of an environment."""
         return cls(
-            spec=env.spec,
+            spec=announced(env.spec),
             observations=dict(env.observation_spec()),
             action=env.action_spec(),
             period_s=env.spec.control_period_s,

@@ -20,11 +20,13 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.errors import OptionError
+from hvs_suite.tasks.shared import robustness
 from hvs_suite.tasks.shared.family import register
 from hvs_suite.tasks.shared.goal import Goal
 from hvs_suite.tasks.shared.obstacles import Obstacles, ObstaclesSpec
 from hvs_suite.tasks.shared.placing import HARD, Placing, PlacingSpec
 from hvs_suite.tasks.shared.props import Placed, Props
+from hvs_suite.tasks.shared.robustness import Axis
 from hvs_suite.tasks.shared.scenario import Scenario, Streams
 from hvs_suite.tasks.shared.spec import Description, VectorObservation
 from hvs_suite.tasks.shared.things import COLOURS, MARKER, Things, ThingsSpec, disc_name
@@ -78,6 +80,15 @@ class ClutterSpec(ThingsSpec, ObstaclesSpec, PlacingSpec):
             f"Place the flange centred over {thing}, facing it, "
             f"{self.standoff_m * 1000:.0f} mm above the surface{careful}."
         )
+
+    def robustness_axes(self) -> tuple[Axis, ...]:
+        """Without another marker: the task names its colour and its outline."""
+        none = Axis(
+            "marker",
+            "unseen marker",
+            "colour and outline are what tells the target from the others",
+        )
+        return robustness.replaced(super().robustness_axes(), none)
 
     def describe(self) -> Description:
         """The task in words."""
@@ -210,6 +221,10 @@ class Clutter(Placing[ClutterSpec, ClutterScenario]):
         kinds = self._things.kinds
         placed = self.scenario.placed
         return [(kinds[each.prop], each.pose[:2]) for each in placed if each.prop in kinds]
+
+    def occupied(self) -> FloatArray:
+        """Where anything lies or stands."""
+        return np.array([each.pose[:2] for each in self.scenario.placed])
 
     def obstacles(self) -> tuple["Solid", ...]:
         """All obstacles; the one that moves with all its lane until it rests."""

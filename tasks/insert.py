@@ -162,7 +162,7 @@ class InsertScenario(Scenario):
 
 
 class Insert(Family[InsertSpec, InsertScenario]):
-    """One bushing.
+    """A peg that goes into one bushing.
 
     Raises:
         OptionError: The arm cannot lift the tool over the bushing.

@@ -163,6 +163,10 @@ class Sequence(Placing[SequenceSpec, SequenceScenario]):
         """Over the present target; where the next one will be nobody knows."""
         return self._goal
 
+    def occupied(self) -> FloatArray:
+        """Where targets are, now or later."""
+        return self.scenario.targets[:, :2]
+
     def at_reset(self) -> dict[str, float]:
         """None has been reached."""
         return {MISSED: float(self.spec.n_targets)}

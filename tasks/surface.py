@@ -24,11 +24,13 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.errors import OptionError
+from hvs_suite.tasks.shared import robustness
 from hvs_suite.tasks.shared.family import register
 from hvs_suite.tasks.shared.goal import Goal
 from hvs_suite.tasks.shared.panels import OFF_CENTRE_M, SIDE_M, Panels, PanelSpec
 from hvs_suite.tasks.shared.placing import HARD, Placing, is_reachable
-from hvs_suite.tasks.shared.scenario import Scenario, Streams
+from hvs_suite.tasks.shared.robustness import Axis
+from hvs_suite.tasks.shared.scenario import Scenario, Streams, towards
 from hvs_suite.tasks.shared.spec import Description, scene
 
 if TYPE_CHECKING:
@@ -62,6 +64,10 @@ class SurfaceSpec(PanelSpec):
             raise OptionError(f"marker is {self.marker!r}; surface's targets are discs")
         if self.start == "fixed":
             raise OptionError("start is 'fixed', where some panel would stand; use zero or random")
+
+    def robustness_axes(self) -> tuple[Axis, ...]:
+        """The target is always a disc, which may have another paint."""
+        return robustness.replaced(super().robustness_axes(), robustness.target_hue())
 
     def describe(self) -> Description:
         """The task in words."""
@@ -158,10 +164,11 @@ class Surface(Placing[SurfaceSpec, SurfaceScenario]):
 
     def _draw_paint(self, streams: Streams) -> FloatArray:
         """Colour of the panel: primer, or anything pale where colours vary."""
-        random = streams.generator("paint")
+        random, primer = streams.generator("paint"), np.array([0.70, 0.72, 0.66])
         if not self.spec.vary_colour:
-            return np.array([0.70, 0.72, 0.66])
-        return np.asarray(np.clip(random.uniform(0.4, 0.9) + random.uniform(-0.08, 0.08, 3), 0, 1))
+            return primer
+        paint = np.clip(random.uniform(0.4, 0.9) + random.uniform(-0.08, 0.08, 3), 0, 1)
+        return np.asarray(np.clip(towards(primer, paint, self.spec.colour_strength), 0, 1))
 
     def after_compile(self, physics: "mjcf.Physics") -> None:
         """Look up target, marks and panels in the compiled model."""

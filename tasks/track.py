@@ -202,6 +202,11 @@ class Track(Placing[TrackSpec, TrackScenario]):
             np.array([x, y, 0.0]), UP, self.spec.standoff_m, velocity=np.array([vx, vy, 0.0])
         )
 
+    def occupied(self) -> FloatArray:
+        """The whole way of the target."""
+        n_times = round(self.spec.motion_s / _CHECK_PERIOD_S) + 1
+        return self.scenario.motion.place(_CHECK_PERIOD_S * np.arange(n_times, dtype=np.float64))
+
     def privileged(self) -> dict[str, FloatArray]:
         """How fast the goal moves, (3,) m/s."""
         return {"goal_velocity": self.goal().velocity}

@@ -1,24 +1,87 @@
 """The sheet that opens for one entry of the board: figures, clips, landings, what it was run on."""
 
-import base64
+import dataclasses
 import urllib.parse
 from collections.abc import Sequence
 
 from hvs_suite import registry
 from hvs_suite.eval.board import plots
-from hvs_suite.eval.board.clips import SIZE, Clip
-from hvs_suite.eval.board.tables import (
-    DASH,
-    SUCCESS,
-    Entry,
-    escaped,
-    figure,
-    iqm_interval,
-    joined,
-)
+from hvs_suite.eval.board.clips import Clip
+from hvs_suite.eval.board.plots import Landings
+from hvs_suite.eval.board.tables import DASH, SUCCESS, Entry, figure, iqm_interval, joined
 from hvs_suite.eval.scoring.result_file import Metadata
 from hvs_suite.names import shown
 from hvs_suite.tasks.shared.metric import Metric
+
+Rows = Sequence[tuple[str, str]]
+
+ERRORS = ("at the end", "interquartile mean", "median", "p95", "p99", "95 % end within")
+"""Headings of `Sheet.errors`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Film:
+    """A clip with what it shows.
+
+    Attributes:
+        number: Its place among the clips of the page.
+        kind: Whether it shows a success or a failure.
+        caption: What happens, in a sentence.
+    """
+
+    number: int
+    kind: str
+    caption: str
+
+    @classmethod
+    def of(cls, number: int, entry: Entry, clip: Clip) -> "Film":
+        """Returns the film of an entry's clip.
+
+        Args:
+            number: Its place among the clips of the page.
+            entry: Whose clip it is.
+            clip: The clip.
+        """
+        row = clip.row
+        if row.success:
+            how = f"is solved in {row.steps} steps"
+        elif row.settled.failure is not None:
+            how = f"is lost after {row.steps} steps ({row.settled.failure})"
+        elif row.collision:
+            how = f"ends with a collision in step {row.steps}"
+        else:
+            how = "is not solved in time"
+        where = ", ".join(
+            f"{metric.title} {figure(row.settled.errors[metric.name])} {metric.unit}".rstrip()
+            for metric in _headline(entry)
+            if metric.name in row.settled.errors
+        )
+        return cls(number, clip.kind, f"Scenario {row.scenario} {how}. At its end: {where}.")
+
+
+@dataclasses.dataclass(frozen=True)
+class Sheet:
+    """What the sheet shows.
+
+    Attributes:
+        entry: The entry.
+        identity: Its name within the page.
+        outcomes: Figures with their titles.
+        films: Its clips; the page may have none.
+        landings: Where it lands, and what the picture shows; None where landings say nothing.
+        errors: Title of each metric and its figures, as `ERRORS` heads them.
+        origin: What it was run on, with titles.
+        command: How anyone can check it.
+    """
+
+    entry: Entry
+    identity: str
+    outcomes: Rows
+    films: Sequence[Film]
+    landings: tuple[Landings, str] | None
+    errors: Sequence[tuple[str, Sequence[str]]]
+    origin: Rows
+    command: str
 
 
 def identity(entry: Entry) -> str:
@@ -31,95 +94,22 @@ def link(entry: Entry) -> str:
     return "#" + urllib.parse.quote(identity(entry))
 
 
-def sheet(entry: Entry, clips: Sequence[Clip]) -> str:
-    """Returns an entry's sheet, a closed dialog.
+def sheet(entry: Entry, films: Sequence[Film]) -> Sheet:
+    """Returns an entry's sheet.
 
     Args:
         entry: The entry.
-        clips: Its clips; the page may have none.
+        films: Its clips.
     """
-    name = escaped(identity(entry))
-    return f"""<dialog id="{name}" aria-labelledby="{name}-title">
-<header><h2 id="{name}-title">{escaped(entry.policy)}
-<small>{escaped(entry.task)}</small></h2>
-<form method="dialog"><button aria-label="Close">\N{MULTIPLICATION SIGN}</button></form></header>
-{_outcomes(entry)}
-{_films(entry, clips)}
-{_landings(entry)}
-{_errors(entry)}
-{_origin(entry)}
-</dialog>"""
-
-
-def _outcomes(entry: Entry) -> str:
-    summary = entry.result.summary
-    rows = [
-        ("success", joined(SUCCESS.text(entry), SUCCESS.interval(entry))),
-        ("solved", f"{summary.n_success} of {summary.n_episodes}"),
-        ("collisions", str(summary.n_collision)),
-        (
-            "lost by its own fault",
-            ", ".join(f"{count} {reason}" for reason, count in summary.failures.items()) or "0",
-        ),
-        ("steps to goal, mean", figure(summary.steps_to_goal_mean)),
-        ("× expert's steps", figure(entry.steps_over_expert)),
-        ("steps out of range", str(summary.n_clipped)),
-        ("verified", entry.proof),
-    ]
-    return _list(rows, "figures")
-
-
-def _films(entry: Entry, clips: Sequence[Clip]) -> str:
-    """Both clips; lazily, so that a closed sheet decodes nothing."""
-    if not clips:
-        return ""
-    width, height = SIZE
-    films = []
-    for clip in clips:
-        row = clip.row
-        if row.success:
-            how = f"solved in {row.steps} steps"
-        elif row.settled.failure is not None:
-            how = f"lost after {row.steps} steps: {row.settled.failure}"
-        elif row.collision:
-            how = f"collides in step {row.steps}"
-        else:
-            how = "not solved in time"
-        where = ", ".join(
-            f"{metric.title} {figure(row.settled.errors[metric.name])} {metric.unit}".rstrip()
-            for metric in metrics_of(entry)
-            if metric.name in row.settled.errors
-        )
-        caption = escaped(f"Scenario {row.scenario}: {how}; at the end {where}.")
-        data = base64.b64encode(clip.avif).decode("ascii")
-        films.append(
-            f'<figure><img loading="lazy" width="{width}" height="{height}" alt="{caption}" '
-            f'src="data:image/avif;base64,{data}">'
-            f"<figcaption><b>A typical {clip.kind}.</b> {caption}</figcaption></figure>"
-        )
-    return f'<div class="films">{"".join(films)}</div>'
-
-
-def _landings(entry: Entry) -> str:
-    rows = entry.result.episodes
-    tolerance = sideways(entry)
-    if tolerance is None:
-        return ""
-    radius = plots.landing_radius(rows)
-    outside = sum(not plots.is_inside(row, radius) for row in rows)
-    caption = "Where the flange stands around the target at the time limit, seen along the normal. "
-    caption += (
-        f"The circle is the tolerance, {tolerance:g} mm."
-        if tolerance <= radius
-        else f"The tolerance, {tolerance:g} mm, lies outside the picture."
-    )
-    if outside:
-        caption += f" {outside} of {len(rows)} landings lie outside the picture."
-    plot = plots.landing_plot(rows, radius, tolerance, "Landings around the target")
-    return (
-        f'<figure class="wide">{plot}<figcaption>{caption}<span class="key">'
-        '<i class="hit"></i>solved<i class="miss"></i>not solved<i class="lost"></i>arm lost'
-        "</span></figcaption></figure>"
+    return Sheet(
+        entry,
+        identity(entry),
+        _outcomes(entry),
+        films,
+        _landings(entry),
+        _errors(entry),
+        _origin(entry),
+        f"hvs verify eval/results/{entry.policy}/{entry.result.summary.task}.json",
     )
 
 
@@ -133,8 +123,45 @@ def sideways(entry: Entry) -> float | None:
     return metric.bound if metric is not None and spec.plays_on else None
 
 
-def metrics_of(entry: Entry) -> list[Metric]:
-    """Returns the headline metrics of an entry's task."""
+def _outcomes(entry: Entry) -> Rows:
+    summary = entry.result.summary
+    return [
+        ("success", joined(SUCCESS.text(entry), SUCCESS.interval(entry))),
+        ("solved", f"{summary.n_success} of {summary.n_episodes}"),
+        ("collisions", str(summary.n_collision)),
+        (
+            "lost by its own fault",
+            ", ".join(f"{count} {reason}" for reason, count in summary.failures.items()) or "0",
+        ),
+        ("steps to goal, mean", figure(summary.steps_to_goal_mean)),
+        ("× expert's steps", figure(entry.steps_over_expert)),
+        ("steps out of range", str(summary.n_clipped)),
+        ("verified", entry.proof),
+    ]
+
+
+def _landings(entry: Entry) -> tuple[Landings, str] | None:
+    tolerance = sideways(entry)
+    if tolerance is None:
+        return None
+    rows = entry.result.episodes
+    picture = plots.landings(rows, plots.landing_radius(rows), tolerance)
+    caption = (
+        "The picture shows where the flange stands around the target at the time limit, seen along "
+        "the normal. "
+    )
+    caption += (
+        f"The tolerance, {tolerance:g} mm, lies outside the picture."
+        if picture.goal is None
+        else f"The circle is the tolerance, {tolerance:g} mm."
+    )
+    if outside := picture.n - picture.n_inside:
+        caption += f" {outside} of {picture.n} landings lie outside the picture."
+    return picture, caption
+
+
+def _headline(entry: Entry) -> list[Metric]:
+    """The headline metrics of an entry's task."""
     spec = registry.find(entry.result.summary.task)
     metrics = {metric.name: metric for metric in spec.metrics}
     return [metrics[name] for name in spec.headline]
@@ -144,42 +171,24 @@ def _title(metric: Metric) -> str:
     return f"{metric.title} ({metric.unit})" if metric.unit else metric.title
 
 
-def _errors(entry: Entry) -> str:
+def _errors(entry: Entry) -> list[tuple[str, list[str]]]:
     """Settled errors, one row each."""
     summary = entry.result.summary
     rows = []
     for metric in registry.find(summary.task).metrics:
         error = summary.settled.errors[metric.name]
         sharpest = summary.settled.sharpest_95.errors[metric.name]
-        cells = (
+        cells = [
             joined(figure(error.iqm), iqm_interval(error)),
             *(figure(value) for value in (error.p50, error.p95, error.p99, sharpest)),
-        )
-        rows.append(
-            f'<tr><th scope="row">{escaped(_title(metric))}</th>'
-            + "".join(f"<td>{escaped(cell)}</td>" for cell in cells)
-            + "</tr>"
-        )
-    head = "".join(
-        f'<th scope="col">{title}</th>'
-        for title in (
-            "settled error",
-            "interquartile mean",
-            "median",
-            "p95",
-            "p99",
-            "95 % settle within",
-        )
-    )
-    return (
-        f'<div class="sheet"><table class="matrix"><thead><tr>{head}</tr></thead>'
-        f"<tbody>{''.join(rows)}</tbody></table></div>"
-    )
+        ]
+        rows.append((_title(metric), cells))
+    return rows
 
 
-def _origin(entry: Entry) -> str:
+def _origin(entry: Entry) -> Rows:
     metadata, summary, timings = entry.result.metadata, entry.result.summary, entry.result.timings
-    rows = [
+    return [
         ("policy", f"{summary.policy} ({metadata.policy_kind})"),
         ("policy hash", _short(metadata.policy_hash)),
         ("parameters", _count(metadata.policy_parameters)),
@@ -199,18 +208,6 @@ def _origin(entry: Entry) -> str:
             ", ".join(f"{name} {version}" for name, version in metadata.packages.items()),
         ),
     ]
-    command = escaped(f"hvs verify eval/results/{entry.policy}/{summary.task}.json")
-    return (
-        f"<details><summary>How it was made</summary>{_list(rows, 'origin')}"
-        f"<p>Check it yourself: <code>{command}</code></p></details>"
-    )
-
-
-def _list(rows: Sequence[tuple[str, str]], kind: str) -> str:
-    items = "".join(
-        f"<div><dt>{escaped(title)}</dt><dd>{escaped(text)}</dd></div>" for title, text in rows
-    )
-    return f'<dl class="{kind}">{items}</dl>'
 
 
 def _short(digest: str | None) -> str:

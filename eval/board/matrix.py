@@ -1,10 +1,12 @@
 """The board's pairwise comparison: which policy beats which on the same scenarios."""
 
+import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from typing import Literal
 
 from hvs_suite import statistics
-from hvs_suite.eval.board.tables import DASH, Entry, escaped
+from hvs_suite.eval.board.tables import Entry
 from hvs_suite.eval.scoring.comparison import SIGNIFICANT, Tally
 
 CAPTION = (
@@ -14,60 +16,56 @@ CAPTION = (
 )
 
 
-def matrix(entries: Sequence[Entry]) -> str:
-    """Returns the comparison of a task's entries, each with each, as an HTML table."""
+@dataclasses.dataclass(frozen=True)
+class Pair:
+    """One policy against another.
+
+    Attributes:
+        other: The policy that it is held against.
+        decided: Whether the first is ``better`` or ``worse``, or the scenarios cannot tell.
+        points: Difference in success (percentage points), as people read it.
+        p: The corrected p, as people read it.
+        counts: Who solves how many, in words.
+    """
+
+    other: str
+    decided: Literal["better", "worse", "even"]
+    points: str
+    p: str
+    counts: str
+
+
+def matrix(entries: Sequence[Entry]) -> dict[str, list[Pair | None]]:
+    """Returns the comparison of a task's entries, each with each; None with itself.
+
+    Args:
+        entries: Two or more.
+
+    Returns:
+        Each policy's row, its columns in the order of the rows.
+    """
     outcomes = {e.policy: {r.scenario: r.success for r in e.result.episodes} for e in entries}
-    tallies = {
+    pairs = {
         (a, b): Tally.of(outcomes[a], outcomes[b]) for a, b in itertools.combinations(outcomes, 2)
     }
-    corrected = statistics.holm([tally.p for tally in tallies.values()])
-    p_values = dict(zip(tallies, corrected, strict=True))
-    head = "".join(
-        f'<th scope="col" data-policy="{escaped(name)}">{escaped(name)}</th>' for name in outcomes
+    corrected = statistics.holm([tally.p for tally in pairs.values()])
+    cells: dict[tuple[str, str], Pair] = {}
+    for ((a, b), tally), p in zip(pairs.items(), corrected, strict=True):
+        cells[a, b] = _pair(a, b, tally, p)
+        turned = dataclasses.replace(tally, n_only_a=tally.n_only_b, n_only_b=tally.n_only_a)
+        cells[b, a] = _pair(b, a, turned, p)
+    return {a: [cells.get((a, b)) for b in outcomes] for a in outcomes}
+
+
+def _pair(a: str, b: str, tally: Tally, p: float) -> Pair:
+    points = 100 * (tally.n_only_a - tally.n_only_b) / tally.n
+    return Pair(
+        other=b,
+        decided="even" if p >= SIGNIFICANT else "better" if points > 0 else "worse",
+        points=f"{points:+.1f}".replace("-", "\N{MINUS SIGN}") if points else "0",
+        p="p < 0.001" if p < 0.001 else f"p = {p:.3f}" if p < 0.1 else f"p = {p:.2f}",
+        counts=(
+            f"{a} alone solves {tally.n_only_a}, {b} alone {tally.n_only_b}, both {tally.n_both}, "
+            f"neither {tally.n_neither} of {tally.n}"
+        ),
     )
-    rows = []
-    for a in outcomes:
-        cells = "".join(_cell(a, b, tallies, p_values) for b in outcomes)
-        name = escaped(a)
-        rows.append(f'<tr data-policy="{name}"><th scope="row">{name}</th>{cells}</tr>')
-    return (
-        '<div class="sheet"><table class="matrix pairs"><thead><tr><td></td>'
-        f"{head}</tr></thead>\n<tbody>{chr(10).join(rows)}</tbody></table></div>"
-    )
-
-
-def _cell(
-    a: str,
-    b: str,
-    tallies: Mapping[tuple[str, str], Tally],
-    p_values: Mapping[tuple[str, str], float],
-) -> str:
-    column = f'data-policy="{escaped(b)}"'
-    if a == b:
-        return f'<td class="self" {column}>{DASH}</td>'
-    if (a, b) in tallies:
-        tally, p = tallies[a, b], p_values[a, b]
-        only_a, only_b = tally.n_only_a, tally.n_only_b
-    else:
-        tally, p = tallies[b, a], p_values[b, a]
-        only_a, only_b = tally.n_only_b, tally.n_only_a
-    points = 100 * (only_a - only_b) / tally.n
-    decided = "even" if p >= SIGNIFICANT else "better" if points > 0 else "worse"
-    told = escaped(
-        f"{a} alone solves {only_a}, {b} alone {only_b}, both {tally.n_both}, neither "
-        f"{tally.n_neither} of {tally.n}"
-    )
-    return (
-        f'<td class="{decided}" {column} title="{told}">{_signed(points)}'
-        f"<small>{_p_text(p)}</small></td>"
-    )
-
-
-def _signed(points: float) -> str:
-    return f"{points:+.1f}".replace("-", "\N{MINUS SIGN}") if points else "0"
-
-
-def _p_text(p: float) -> str:
-    if p < 0.001:
-        return "p &lt; 0.001"
-    return f"p = {p:.3f}" if p < 0.1 else f"p = {p:.2f}"

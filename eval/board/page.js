@@ -1,54 +1,88 @@
 "use strict";
-// Sorting: by a heading, or on a phone by the choice above the cards.
-for (const sheet of document.querySelectorAll(".sortable")) {
-  const body = sheet.querySelector("tbody");
-  const heads = [...sheet.querySelectorAll("thead th")];
-  const choice = sheet.parentElement.querySelector("select");
+// Sorting: by a heading, or where cards have none by the choice above them. What is missing comes
+// last either way, and no row leaves its part of the table.
+for (const part of document.querySelectorAll(".sortable")) {
+  const heads = [...part.querySelectorAll("thead th")];
+  const choice = part.querySelector("select.sort");
+  const show = part.querySelector("select.show");
+  const falls = head =>
+    "down" in (head.classList.contains("shown") ? show.selectedOptions[0] : head).dataset;
   const sort = (column, down) => {
-    const sign = down ? -1 : 1;
-    const key = row => row.children[column].dataset.value;
+    const key = row => {
+      const cell = row.children[column];
+      return (cell.querySelector("[data-value]:not([hidden])") ?? cell).dataset.value ?? "";
+    };
     const compare = (a, b) => {
       const x = key(a), y = key(b);
-      // What is missing comes last either way.
       if (x === "" || y === "") return (x === "") - (y === "");
-      return sign * (column ? x - y : x.localeCompare(y));
+      return (down ? -1 : 1) * (column ? x - y : x.localeCompare(y));
     };
-    body.append(...[...body.rows].sort(compare));
+    for (const body of part.querySelectorAll("tbody"))
+      body.append(...[...body.querySelectorAll("[data-policy]")].sort(compare));
     heads.forEach(head => head.removeAttribute("aria-sort"));
     heads[column].setAttribute("aria-sort", down ? "descending" : "ascending");
-    if (choice) choice.value = column;
+    choice.value = column;
   };
   heads.forEach((head, column) => head.querySelector("button").addEventListener("click", () => {
     const now = head.getAttribute("aria-sort");
-    sort(column, now ? now === "ascending" : "down" in head.dataset);
+    sort(column, now ? now === "ascending" : falls(head));
   }));
-  choice?.addEventListener("change", () => {
+  choice.addEventListener("change", () => {
     const column = Number(choice.value);
-    sort(column, "down" in heads[column].dataset);
+    sort(column, falls(heads[column]));
+  });
+
+  // Showing another figure of a family's tasks; only success has a mean over them.
+  show?.addEventListener("change", () => {
+    for (const figure of part.querySelectorAll("[data-figure]"))
+      figure.hidden = figure.dataset.figure !== show.value;
+    part.classList.toggle("meanless", show.value !== "0");
+    heads.forEach(head => head.removeAttribute("aria-sort"));
   });
 }
 
-// Searching: every word must stand in the policy's name; what does not match leaves the whole page.
+// Searching: every word must stand in the name of a policy or of one of its tasks. What does not
+// match leaves the whole page.
 const search = document.getElementById("search");
-const marked = [...document.querySelectorAll("[data-policy]")];
-const policies = new Set(marked.map(part => part.dataset.policy));
+const toggle = (part, stays) => part.classList.toggle("gone", !stays);
+const anyLeft = part => part.querySelector("[data-policy]:not(.gone)") !== null;
 const look = () => {
   const words = search.value.toLowerCase().split(/\s+/).filter(Boolean);
-  const fits = name => words.every(word => name.toLowerCase().includes(word));
-  for (const part of marked) part.classList.toggle("gone", !fits(part.dataset.policy));
-  const n = [...policies].filter(fits).length;
+  const fits = (policy, task) => {
+    const name = `${policy} ${task}`.toLowerCase();
+    return words.every(word => name.includes(word));
+  };
+  for (const row of document.querySelectorAll("[data-tasks]")) {
+    const tasks = row.dataset.tasks.trim().split(" ");
+    toggle(row, tasks.some(task => fits(row.dataset.policy, task)));
+  }
+  const tasks = [...document.querySelectorAll("details.task")];
+  for (const task of tasks) {
+    for (const part of task.querySelectorAll("[data-policy]"))
+      toggle(part, fits(part.dataset.policy, task.dataset.task));
+    toggle(task, anyLeft(task.querySelector("tbody")));
+    const card = document.querySelector(`.strip [data-task="${CSS.escape(task.dataset.task)}"]`);
+    if (card) toggle(card, !task.classList.contains("gone"));
+  }
+  for (const family of document.querySelectorAll(".family"))
+    toggle(family, anyLeft(family.querySelector("tbody")));
+  for (const study of document.querySelectorAll(".study"))
+    toggle(study, JSON.parse(study.dataset.policies).some(policy => fits(policy, study.dataset.task)));
+  const count = parts =>
+    `${parts.filter(part => !part.classList.contains("gone")).length} of ${parts.length}`;
+  const rows = [...document.querySelectorAll("#all-families [data-policy]")];
   document.getElementById("found").textContent =
-    words.length ? `${n} of ${policies.size} policies` : "";
+    words.length ? `${count(rows)} policies, ${count(tasks)} tasks` : "";
 };
 search.addEventListener("input", look);
 look();
 
 // Pointing at a policy, in a table or a legend, picks out its curves.
-for (const section of document.querySelectorAll("section")) {
-  const curves = [...section.querySelectorAll("g[data-policy]")];
+for (const task of document.querySelectorAll("details.task")) {
+  const curves = [...task.querySelectorAll("g[data-policy]")];
   const pick = name => curves.forEach(
     curve => curve.classList.toggle("faint", name !== null && curve.dataset.policy !== name));
-  for (const part of section.querySelectorAll("tbody tr[data-policy], .legend [data-policy]")) {
+  for (const part of task.querySelectorAll("tbody tr[data-policy], .legend [data-policy]")) {
     for (const event of ["pointerenter", "focusin"])
       part.addEventListener(event, () => pick(part.dataset.policy));
     for (const event of ["pointerleave", "focusout"])
@@ -56,15 +90,29 @@ for (const section of document.querySelectorAll("section")) {
   }
 }
 
-// Opening: an entry's address is #<task>/<policy>, so that it can be linked to.
+// Clips: each stands once at the end of the page, and becomes a picture where it comes into view.
+const reel = JSON.parse(document.getElementById("reel").textContent);
+const projector = new IntersectionObserver(seen => {
+  for (const {target, isIntersecting} of seen) {
+    if (!isIntersecting) continue;
+    target.src = `data:image/avif;base64,${reel[target.dataset.clip]}`;
+    projector.unobserve(target);
+  }
+}, {rootMargin: "200px"});
+for (const clip of document.querySelectorAll("[data-clip]")) projector.observe(clip);
+
+// Opening: a task's address is #<task>, an entry's #<task>/<policy>, so that they can be linked to.
 const open = () => {
   for (const shown of document.querySelectorAll("dialog[open]")) shown.close();
   let name = "";
   try { name = decodeURIComponent(location.hash.slice(1)); } catch { /* no address of ours */ }
-  const sheet = document.getElementById(name);
-  if (sheet instanceof HTMLDialogElement) {
-    sheet.showModal();
-    sheet.scrollTop = 0;
+  const part = document.getElementById(name);
+  if (part instanceof HTMLDialogElement) {
+    part.showModal();
+    part.scrollTop = 0;
+  } else if (part instanceof HTMLDetailsElement) {
+    part.open = true;
+    part.scrollIntoView();
   }
 };
 for (const sheet of document.querySelectorAll("dialog")) {

@@ -1,28 +1,43 @@
-"""What the board shows, whatever draws it: entries, their order, columns, and Markdown."""
+"""What the board shows, whatever draws it: entries, their order, and their columns."""
 
 import dataclasses
-import html
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 
-from hvs_suite import registry, statistics
+from hvs_suite import registry
 from hvs_suite.eval.board.submission import Submission
 from hvs_suite.eval.scoring.result_file import Result, SettledErrorSummary
-from hvs_suite.names import shown
 from hvs_suite.registry import TASKS
 
-NOTE = (
-    "Success is the share of scenarios solved, with its Wilson 95 % interval. Steps to goal are "
-    "the mean over successes, beside it as a multiple of the expert's on the scenarios that both "
-    "solve. Settled errors are taken at the time limit, the goal not ending the episode, over all "
-    "episodes, failures included: interquartile mean with its bootstrap interval, and 95th "
-    "percentile. The sharpest tolerance is the multiple of the task's own that 95 % of the "
-    "scenarios settle within. Verified says what is proven. Replayed: the logged actions of so "
-    "many scenarios, drawn after the result was handed in, were played again and gave the same "
-    "numbers; that the named policy chose them, and how fast, is its submitter's word. Re-run: the "
-    "maintainers ran the policy themselves, its weights or its server, on scenarios that nobody "
-    "had seen, and reached a success that agrees."
+NOTES = (
+    ("success", "The share of scenarios solved, with its Wilson 95 % interval."),
+    (
+        "steps to goal",
+        "Their mean over the successes. Beside it stands how many times the expert's that is, on "
+        "the scenarios that both solve.",
+    ),
+    (
+        "errors, forces, shares of time",
+        "What the family measures, over all episodes, failures included: the interquartile mean "
+        "with its bootstrap 95 % interval. Settled errors are taken at the time limit, because "
+        "there the goal does not end the episode.",
+    ),
+    (
+        "sharpest tolerance",
+        "The multiple of the task's own tolerances that 95 % of the scenarios end within.",
+    ),
+    (
+        "replayed",
+        "The logged actions of so many scenarios, drawn after the result was handed in, were "
+        "played again and gave the same numbers. That the named policy chose them, and how fast, "
+        "is its submitter's word.",
+    ),
+    (
+        "re-run",
+        "The maintainers ran the policy itself, its weights or its server, on scenarios that "
+        "nobody had seen, and reached a success that agrees.",
+    ),
 )
+"""What the figures mean: term and explanation."""
 DRAFT = (
     "This is a draft: results on it may hold fewer scenarios than a score takes, and nobody has "
     "held them against the rules of the board."
@@ -75,6 +90,7 @@ class Column:
         text: The figure as people read it.
         larger_first: Sorting by it starts with the largest.
         interval: Its 95 % interval as people read it; empty where it has none.
+        is_detail: The page shows it in the entry's sheet alone.
     """
 
     title: str
@@ -82,6 +98,7 @@ class Column:
     text: Callable[[Entry], str]
     larger_first: bool = False
     interval: Callable[[Entry], str] = lambda entry: ""
+    is_detail: bool = False
 
 
 SUCCESS = Column(
@@ -155,6 +172,7 @@ def _tail(name: str, unit: str) -> Column:
         f"p95 ({unit})" if unit else "p95",
         lambda e: e.result.summary.settled.errors[name].p95,
         lambda e: figure(e.result.summary.settled.errors[name].p95),
+        is_detail=True,
     )
 
 
@@ -215,124 +233,17 @@ def _first_metric(entry: Entry) -> str:
     return registry.find(entry.result.summary.task).headline[0]
 
 
-@dataclasses.dataclass(frozen=True)
-class Overall:
-    """One policy over all tasks of the board.
-
-    Attributes:
-        policy: Name on the board.
-        entries: Its entries by task.
-        mean: Mean success (percent), over the families that it was scored on, of each family's
-            mean. A task of such a family that it was not scored on counts as 0 %, so that leaving
-            out the hard ones does not lift it.
-        low: Lower end of the mean's 95 % interval (percent).
-        high: Upper end.
-        n_families: Families that it was scored on.
-        of_families: Families on the board.
-    """
-
-    policy: str
-    entries: Mapping[str, Entry]
-    mean: float
-    low: float
-    high: float
-    n_families: int
-    of_families: int
-
-    @property
-    def coverage(self) -> str:
-        """How much of the board it was scored on."""
-        return f"{self.n_families} of {self.of_families}"
-
-
-def overall(entries: Sequence[Entry]) -> list[Overall]:
-    """Returns each policy over all tasks: more families first, then the better mean, then by name.
-
-    Args:
-        entries: Of the whole board.
-    """
-    rows: dict[str, dict[str, Entry]] = {}
-    for entry in sorted(entries, key=lambda e: (e.policy, e.task)):
-        rows.setdefault(entry.policy, {})[entry.task] = entry
-    family = {entry.task: registry.find(entry.result.summary.task).family for entry in entries}
-    size = Counter(family.values())
-    table = []
-    for policy, row in rows.items():
-        scored = {family[task] for task in row}
-        weights = [1.0 / (size[family[task]] * len(scored)) for task in row]
-        summaries = [entry.result.summary for entry in row.values()]
-        low, high = statistics.mean_rate_interval(
-            [(s.n_success, s.n_episodes) for s in summaries], weights=weights
-        )
-        mean = sum(w * s.pc_success for w, s in zip(weights, summaries, strict=True))
-        table.append(Overall(policy, row, mean, low, high, len(scored), len(size)))
-    return sorted(table, key=lambda row: (-row.n_families, -row.mean, row.policy))
-
-
-MEANS = (
-    "Mean success: first over the tasks of a family, where one without a result counts as 0 %, "
-    "then over the families that a policy was scored on. Policies that were scored on more "
-    "families come first."
-)
-
-
-def describe(task: str) -> str:
-    """Returns what a task (its name, without version) asks for, in one line."""
+def describe(task: str) -> list[tuple[str, str]]:
+    """Returns what a task (its name, without version) asks for, as (what, in words)."""
     words = registry.find(task).describe()
     held = f", held for {words.held}" if words.held else ""
-    return (
-        f"start {words.start}; target: {words.target}; within {words.tolerance}{held}; "
-        f"{words.time}; disturbed: {'nothing' if words.disturbances == '-' else words.disturbances}"
-    )
-
-
-def markdown(entries: Sequence[Entry], *, draft: bool = False) -> str:
-    """Returns the board as Markdown; the same entries give the same text.
-
-    Args:
-        entries: One or more.
-        draft: Say that it is one.
-    """
-    tables = by_task(entries)
-    lines = [
-        "# Leaderboard",
-        "",
-        *([f"**{DRAFT}**", ""] if draft else []),
-        "`leaderboard.html` beside this file shows more: curves, landings, comparisons and clips. "
-        "[SUBMITTING.md](SUBMITTING.md) says how to add a policy.",
-        "",
-        NOTE,
-        "",
-        "## All tasks",
-        "",
-        MEANS,
-        "",
+    return [
+        ("Start", words.start),
+        ("Target", words.target),
+        ("Success", f"{words.tolerance}{held}"),
+        ("Time", words.time),
+        ("Disturbed", "nothing" if words.disturbances == "-" else words.disturbances),
     ]
-    lines += _table(
-        ["policy", "mean", "families", *tables],
-        [
-            [
-                row.policy,
-                joined(percent(row.mean), interval(row.low, row.high)),
-                row.coverage,
-                *(_cell(row.entries.get(task)) for task in tables),
-            ]
-            for row in overall(entries)
-        ],
-    )
-    for task, table in tables.items():
-        summary = table[0].result.summary
-        lines += ["", f"## {task}", "", describe(summary.task)]
-        lines += [f"Split `{_plain(summary.split)}`.", ""]
-        lines += _table(
-            ["policy", *(column.title for column in columns(summary.task))],
-            [
-                [e.policy, *(joined(c.text(e), c.interval(e)) for c in columns(summary.task))]
-                for e in table
-            ],
-        )
-    lines += ["", "Written by `hvs leaderboard` from the result files; do not edit.", ""]
-    return "\n".join(lines)
 
 
 def share(entry: Entry, count: int) -> float:
@@ -381,31 +292,3 @@ def _steps_over(result: Result, expert: Result) -> float | None:
         if own.steps_to_goal is not None and theirs.steps_to_goal is not None
     ]
     return sum(own for own, _ in pairs) / sum(steps for _, steps in pairs) if pairs else None
-
-
-def escaped(text: str) -> str:
-    """Returns text that HTML, and whoever reads it, takes for nothing but what it is."""
-    return html.escape(shown(text))
-
-
-def _cell(entry: Entry | None) -> str:
-    if entry is None:
-        return DASH
-    return joined(SUCCESS.text(entry), SUCCESS.interval(entry))
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Returns a Markdown table: names on the left, figures on the right."""
-    return [
-        "| " + " | ".join(_plain(cell) for cell in head) + " |",
-        "|---" + "|--:" * (len(head) - 1) + "|",
-        *("| " + " | ".join(_plain(cell) for cell in row) + " |" for row in rows),
-    ]
-
-
-def _plain(text: str) -> str:
-    """Returns text that Markdown takes for nothing but text."""
-    text = shown(text)
-    for character in "\\|`<>[]*_":
-        text = text.replace(character, f"&#{ord(character)};")
-    return text

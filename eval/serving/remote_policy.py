@@ -369,7 +369,7 @@ def find(
 
 def hello(task: str, env: Any) -> wire.Message:
     """Returns the first message: which task is to be played, and what of it is public."""
-    spec = env.spec
+    spec = registry.announced(env.spec)
     return {
         "type": "hello",
         "protocol": wire.PROTOCOL,

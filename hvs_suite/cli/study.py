@@ -212,6 +212,65 @@ class FewDemonstrations:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Robustness(Players):
+    """Measure where a policy breaks: one thing at a time differs from the task, at three strengths.
+
+    Light, colours, texture, camera poses, noise, blur, latency, joint offsets, distractors, target
+    and all of them together come unannounced: the policy is told of the task as named. Each scene
+    is paired with the undisturbed one. Interrupted, the same command goes on.
+
+    Attributes:
+        task: Named task.
+        out: Folder of the study: study.json, study.md, study.png, and a result file a cell.
+        policy: As 'hvs evaluate' takes it.
+        axis: What to disturb, such as light; give it several times; everything by default.
+        split: Split whose first scenes are played.
+        episodes: Scenes a cell; undisturbed ones are played as well.
+        beside: Another study.json of the same task, to draw beside this one; give it several times.
+    """
+
+    task: str
+    out: Path
+    policy: str
+    axis: tuple[str, ...] = ()
+    split: str = "test"
+    episodes: int = 200
+    beside: tuple[Path, ...] = ()
+
+    def run(self) -> None:
+        """Play, showing how it goes; write and print what was found."""
+        from hvs_suite.eval.scoring import robustness_file
+        from hvs_suite.eval.studies import robustness, robustness_report
+        from hvs_suite.files import check_writable
+
+        check_writable(self.out / "study.json")
+        others = [robustness_file.load(path) for path in self.beside]
+        for path, other in zip(self.beside, others, strict=True):
+            if other.task != self.task:
+                raise OptionError(f"{path} is a study of {other.task}, not of {self.task}")
+        plan = robustness.Plan(
+            policy=self.policy,
+            task=self.task,
+            axes=self.axis,
+            split=self.split,
+            episodes=self.episodes,
+            workers=self.players(),
+        )
+        with console.meter() as update:
+            study = robustness.run_study(
+                plan, self.out, update, lambda found: _write_json(self.out, found)
+            )
+        text = robustness_report.markdown(study)
+        _write_report(self.out, text, robustness_report.draw([study, *others]))
+        console.print_table(
+            robustness_report.COLUMNS,
+            robustness_report.rows(study),
+            robustness_report.title(study),
+        )
+        print(f"wrote {self.out / 'study.json'}, study.md and study.png")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Attention:
     """Draw where an hvs policy looks in both cameras, through one episode.
 
@@ -286,6 +345,7 @@ class Study:
         Annotated[Compression, tyro.conf.subcommand("compression")]
         | Annotated[Ablation, tyro.conf.subcommand("ablation")]
         | Annotated[FewDemonstrations, tyro.conf.subcommand("few-demonstrations")]
+        | Annotated[Robustness, tyro.conf.subcommand("robustness")]
         | Annotated[Attention, tyro.conf.subcommand("attention")],
         tyro.conf.OmitSubcommandPrefixes,
         tyro.conf.OmitArgPrefixes,

@@ -4,6 +4,7 @@ Every reset first restores what the model was compiled with, so nothing of an ea
 remains.
 """
 
+import colorsys
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from hvs_suite.cell.arena import Cell
 from hvs_suite.cell.surface import TEXTURE_SIDE_PX
-from hvs_suite.tasks.shared.scenario import Scenario
+from hvs_suite.tasks.shared.scenario import Scenario, towards
+from hvs_suite.tasks.shared.spec import Disturbances
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -29,13 +31,16 @@ class Appearance:
     Args:
         physics: The compiled cell.
         cell: Its description.
+        spec: How far scenarios change the look.
     """
 
-    def __init__(self, physics: mjcf.Physics, cell: Cell) -> None:
+    def __init__(self, physics: mjcf.Physics, cell: Cell, spec: Disturbances) -> None:
         model = physics.model.ptr
+        self._spec = spec
         self.changed_textures: tuple[int, ...] = ()
         self._painted = False
         self._eth = int(physics.bind(cell.eth).element_id)
+        self._eih = int(physics.bind(cell.eih).element_id)
         self._light = int(physics.bind(cell.light).element_id)
         self._surface = int(physics.bind(cell.surface.material).element_id)
         self._targets = [int(physics.bind(marker.material).element_id) for marker in cell.markers]
@@ -55,23 +60,31 @@ class Appearance:
 
     def apply(self, physics: mjcf.Physics, scenario: Scenario) -> None:
         """Write the look of a scenario."""
-        model = physics.model.ptr
+        model, spec = physics.model.ptr, self._spec
         for name, value in self._defaults.items():
             getattr(model, name)[:] = value
-        diffuse, ambient = scenario.light_level
+        diffuse, ambient = towards(np.ones(2), scenario.light_level, spec.light_strength)
         model.light_diffuse[self._light] *= diffuse
         model.vis.headlight.ambient[:] = self._ambient * ambient
         if scenario.light_direction is not None:
-            model.light_dir[self._light] = scenario.light_direction
-        if scenario.surface_rgb is not None:
-            model.mat_rgba[self._surface, :3] = scenario.surface_rgb
-        if scenario.target_rgb is not None:
-            model.mat_rgba[self._targets, :3] = scenario.target_rgb
-        self._tint_robot(model, scenario.robot_tint)
-        model.cam_pos[self._eth] += scenario.eth_shift
-        turn = Rotation.from_rotvec(scenario.eth_turn)
-        nominal = Rotation.from_quat(model.cam_quat[self._eth], scalar_first=True)
-        model.cam_quat[self._eth] = (turn * nominal).as_quat(scalar_first=True)
+            own = model.light_dir[self._light].copy()
+            direction = towards(own, scenario.light_direction, spec.light_strength)
+            model.light_dir[self._light] = direction
+        for materials, rgb in (
+            ([self._surface], scenario.surface_rgb),
+            (self._targets, scenario.target_rgb),
+        ):
+            if rgb is not None:
+                rgb_there = towards(model.mat_rgba[materials, :3], rgb, spec.colour_strength)
+                model.mat_rgba[materials, :3] = np.clip(rgb_there, 0.0, 1.0)
+        if spec.target_hue_deg:
+            for material in self._targets:
+                own = model.mat_rgba[material, :3]
+                model.mat_rgba[material, :3] = _turned(own, spec.target_hue_deg)
+        self._tint_robot(model, towards(np.ones(3), scenario.robot_tint, spec.colour_strength))
+        _displace(model, self._eth, scenario.eth_shift, scenario.eth_turn)
+        if scenario.eih_shift is not None and scenario.eih_turn is not None:
+            _displace(model, self._eih, scenario.eih_shift, scenario.eih_turn)
         self._paint(model, scenario.texture_seed)
 
     def _tint_robot(self, model: Any, tint: FloatArray) -> None:
@@ -87,13 +100,33 @@ class Appearance:
         picture = (
             np.full((TEXTURE_SIDE_PX, TEXTURE_SIDE_PX), 255, np.uint8)
             if seed is None
-            else surface_texture(seed)
+            else _weakened(surface_texture(seed), self._spec.texture_strength)
         )
         channels = int(model.tex_nchannel[self._texture])
         data = np.repeat(picture[..., None], channels, axis=2).ravel()
         model.tex_data[start : start + data.size] = data
         self._painted = seed is not None
         self.changed_textures = (self._texture,)
+
+
+def _displace(model: Any, camera: int, shift: FloatArray, turn: FloatArray) -> None:
+    """Move and turn a camera in the frame of its body: (3,) m, and a rotation vector (3,) rad."""
+    model.cam_pos[camera] += shift
+    nominal = Rotation.from_quat(model.cam_quat[camera], scalar_first=True)
+    turned = Rotation.from_rotvec(turn) * nominal
+    model.cam_quat[camera] = turned.as_quat(scalar_first=True)
+
+
+def _turned(rgb: FloatArray, hue_deg: float) -> tuple[float, float, float]:
+    """A colour with its hue turned."""
+    hue, saturation, value = colorsys.rgb_to_hsv(*rgb.tolist())
+    return colorsys.hsv_to_rgb((hue + hue_deg / 360.0) % 1.0, saturation, value)
+
+
+def _weakened(texture: npt.NDArray[np.uint8], strength: float) -> npt.NDArray[np.uint8]:
+    """A texture as deep as the strength says; 1 leaves it as it is."""
+    white = np.full(texture.shape, 255.0)
+    return np.clip(towards(white, texture.astype(np.float64), strength), 0, 255).astype(np.uint8)
 
 
 def surface_texture(seed: int) -> npt.NDArray[np.uint8]:

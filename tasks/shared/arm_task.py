@@ -32,6 +32,7 @@ from hvs_suite.tasks.shared.family import Family, Progress
 from hvs_suite.tasks.shared.goal import LATERAL, POSITION, TILT, Goal, Keypoint, Tip, goal_errors
 from hvs_suite.tasks.shared.scenario import Scenario, ScenarioSource
 from hvs_suite.tasks.shared.spec import CAMERA_NAMES, Spec
+from hvs_suite.tasks.shared.strewn import Strewn
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -92,6 +93,7 @@ class ArmTask(composer.Task):
             eth_look_at_m=spec.eth_look_at_m,
         )
         family.build(self._cell)
+        self._strewn = Strewn(self._cell, spec) if spec.n_strewn else None
         self.source = ScenarioSource(spec, family.named, split, family.draw)
         self.time_limit_steps = spec.time_limit_steps
         self.camera_side = max(spec.eih_resolution, spec.eth_resolution)
@@ -167,7 +169,9 @@ class ArmTask(composer.Task):
             for name in CAMERA_NAMES
         }
         self.family.after_compile(physics)
-        self._appearance = appearance.Appearance(physics, cell)
+        if self._strewn is not None:
+            self._strewn.after_compile(physics)
+        self._appearance = appearance.Appearance(physics, cell, spec)
         self._rays = np.zeros(mujoco.mjNGROUP, np.uint8)
         self._rays[: SHELL_GROUP + 1] = 1
 
@@ -190,6 +194,9 @@ class ArmTask(composer.Task):
         # The set point starts where the arm is: MuJoCo's default of 0 would throw it.
         data.act[self._act] = scenario.start
         self.family.begin(physics, scenario)
+        if self._strewn is not None:
+            streams = self.source.streams(scenario.index)
+            self._strewn.lay(physics, streams, self.family.occupied())
         self._appearance.apply(physics, scenario)
         start = scenario.start + scenario.joint_offset
         self._queue = [start.copy() for _ in range(self.spec.latency_steps)]

@@ -185,6 +185,13 @@ class Family[S: Spec, C: Scenario](abc.ABC):
         """What the arm must keep out of beside the surface; of what moves, all that it sweeps."""
         return ()
 
+    def occupied(self) -> FloatArray:
+        """Places where something lies or comes in this scene, (n, 2) m, base frame.
+
+        What a study strews over the table keeps away from them.
+        """
+        return self.goal().target[None, :2]
+
     def privileged(self) -> dict[str, FloatArray]:
         """Further values that only training and the expert may see, by name."""
         return {}

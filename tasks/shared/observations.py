@@ -13,6 +13,7 @@ import numpy.typing as npt
 from dm_control import mjcf
 from dm_control.composer.observation import observable
 from dm_env import specs
+from scipy.ndimage import gaussian_filter
 
 from hvs_suite.cell import cameras
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
@@ -125,6 +126,9 @@ def _picture(task: "ArmTask", name: str, bank: NoiseBank | None) -> Any:
         image = task.environment.renderer.colour(
             physics.data.ptr, task.cameras[name].id, side, side
         )
+        if spec.image_blur_px > 0:
+            # The lens comes before the sensor's noise.
+            image = gaussian_filter(image, (spec.image_blur_px, spec.image_blur_px, 0.0))
         if bank is not None:
             bank.disturb(image, noise.at(task.scenario.index, task.environment.control_steps))
         if channels == 1:
@@ -132,12 +136,12 @@ def _picture(task: "ArmTask", name: str, bank: NoiseBank | None) -> Any:
         return image.astype(np.float32) / np.float32(255) if normalise else image
 
     shape = (side, side, channels)
-    spec = (
+    array = (
         specs.BoundedArray(shape, np.float32, 0.0, 1.0)
         if normalise
         else specs.BoundedArray(shape, np.uint8, 0, 255)
     )
-    return cameras.CameraImage(take, spec)
+    return cameras.CameraImage(take, array)
 
 
 def _depth(task: "ArmTask", name: str) -> Any:

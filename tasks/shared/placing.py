@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from hvs_suite.embodiment import BARE_ARM, Embodiment
 from hvs_suite.errors import OptionError
+from hvs_suite.tasks.shared import robustness
 from hvs_suite.tasks.shared.family import Family
 from hvs_suite.tasks.shared.goal import (
     HEIGHT,
@@ -28,6 +29,7 @@ from hvs_suite.tasks.shared.goal import (
     goal_errors,
 )
 from hvs_suite.tasks.shared.metric import Metric
+from hvs_suite.tasks.shared.robustness import Axis
 from hvs_suite.tasks.shared.scenario import Scenario
 from hvs_suite.tasks.shared.spec import Description, Spec, scene
 
@@ -88,6 +90,15 @@ class RingSpec(Spec):
         return self.ring_m[1]
 
     @property
+    def target_size_m(self) -> float:
+        """Diameter of the target (m)."""
+        return self.target_diameter_m
+
+    def robustness_axes(self) -> tuple[Axis, ...]:
+        """The common ones, and the target's size."""
+        return (*super().robustness_axes(), robustness.target_size(self.target_diameter_m))
+
+    @property
     def look_from_m(self) -> float:
         """How far above the target the tip is where the eye in the hand sees it best (m)."""
         raise NotImplementedError
@@ -135,6 +146,10 @@ class PlacingSpec(RingSpec):
             raise OptionError(
                 "give position_tolerance_mm, or both lateral_tolerance_mm and height_tolerance_mm"
             )
+
+    def robustness_axes(self) -> tuple[Axis, ...]:
+        """The ring's, with another kind of marker."""
+        return robustness.replaced(super().robustness_axes(), robustness.unseen_marker())
 
     @property
     def metrics(self) -> tuple[Metric, ...]:

@@ -32,6 +32,8 @@ MAX_INDEX = 2**62
 # seeds differ by less than 37 share none within their first 26 resets.
 _TEST_STRIDE = 37
 _CUT_SIGMA = 2.0
+_LATER = ("eih_shift", "eih_turn")
+"""Quantities that came when scenes were frozen; without them a scene keeps the digest it had."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -42,6 +44,9 @@ class Look:
         joint_offset: Encoder zero error, (7,) rad: measured = true + offset.
         eth_shift: Displacement of the eye-to-hand camera, (3,) m, base frame.
         eth_turn: Rotation vector that turns it, (3,) rad, base frame.
+        eih_shift: Displacement of the eye in the hand, (3,) m, frame of the body that carries it;
+            None without a hand-eye error.
+        eih_turn: Rotation vector that turns it, (3,) rad, the same frame; None likewise.
         light_direction: Direction of the light, (3,), or None for the cell's own.
         light_level: Brightness of the light and the ambient light, (2,), 1 = the cell's own.
         surface_rgb: Colour of the surface, (3,) in [0, 1], or None for the cell's own.
@@ -59,6 +64,8 @@ class Look:
     target_rgb: FloatArray | None
     robot_tint: FloatArray
     texture_seed: int | None
+    eih_shift: FloatArray | None = None
+    eih_turn: FloatArray | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -77,7 +84,11 @@ class Scenario(Look):
 
     def digest(self) -> str:
         """SHA-256 of all values, rounded so that the last bits of a processor do not matter."""
-        text = json.dumps(dataclasses.asdict(self), sort_keys=True, default=_rounded)
+        values = dataclasses.asdict(self)
+        for name in _LATER:
+            if values[name] is None:
+                del values[name]
+        text = json.dumps(values, sort_keys=True, default=_rounded)
         return hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -222,10 +233,16 @@ class ScenarioSource:
         return self._draw(self.streams(self.check(index)))
 
 
+def towards(own: FloatArray, drawn: FloatArray, strength: float) -> FloatArray:
+    """From one value towards another, which strength 1 reaches to the last bit."""
+    return np.asarray((1.0 - strength) * own + strength * drawn, np.float64)
+
+
 def draw_look(spec: Spec, streams: Streams) -> dict[str, Any]:
     """Draw what every scene has: the fields of `Look`, to be passed on to a scenario."""
     # A measured disturbance is normal, cut at two sigma: redrawing keeps the shape inside.
     light_direction, light_level = _light(spec, streams)
+    has_hand_eye_error = spec.eih_position_noise_m > 0 or spec.eih_rotation_noise_deg > 0
     colour = streams.generator("colour")
     surface_rgb = target_rgb = None
     tint: FloatArray = np.ones(3)
@@ -245,6 +262,12 @@ def draw_look(spec: Spec, streams: Streams) -> dict[str, Any]:
         "target_rgb": target_rgb,
         "robot_tint": tint,
         "texture_seed": int(colour.integers(2**32)) if spec.vary_texture else None,
+        "eih_shift": streams.cut_normal("eih_shift", 3) * spec.eih_position_noise_m
+        if has_hand_eye_error
+        else None,
+        "eih_turn": streams.cut_normal("eih_turn", 3) * np.deg2rad(spec.eih_rotation_noise_deg)
+        if has_hand_eye_error
+        else None,
     }
 
 
@@ -260,7 +283,13 @@ def _light(spec: Spec, streams: Streams) -> tuple[FloatArray | None, FloatArray]
 
 
 def scene_options(spec: Spec, named: Spec | None) -> dict[str, Any]:
-    """The options that shape the scene and differ from the named task's own."""
+    """The options that shape the scene and differ from the named task's own.
+
+    None where they come unannounced: each stream is then the named task's, and what no option
+    changes is where it is there.
+    """
+    if spec.unannounced:
+        return {}
     return {
         name: getattr(spec, name)
         for name in spec.scene_fields

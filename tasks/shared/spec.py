@@ -21,6 +21,7 @@ from hvs_suite.tasks.shared import option_types
 from hvs_suite.tasks.shared.metric import Metric
 
 if TYPE_CHECKING:
+    from hvs_suite.tasks.shared.robustness import Axis
     from hvs_suite.tasks.shared.scenario import Scenario
 
 Start = Literal["zero", "random", "fixed", "near_goal", "mixed"] | tuple[float, ...]
@@ -121,22 +122,44 @@ class Disturbances:
         vary_light: Draw the light's direction and brightness.
         vary_colour: Draw the colours of surface, target and robot.
         vary_texture: Draw a texture for the surface.
+        light_strength: How far the light goes from the cell's own to the one drawn: 1 all the way,
+            more goes past it.
+        colour_strength: The same of the colours.
+        texture_strength: The same of the texture.
+        target_hue_deg: Turn of the target's hue, from red towards yellow (deg).
         eth_position_noise_m: Standard deviation of the eye-to-hand position (m), cut at 2 sigma.
         eth_rotation_noise_deg: Standard deviation of its orientation (deg), cut at 2 sigma.
+        eih_position_noise_m: Hand-eye error: standard deviation of where the eye in the hand is off
+            its nominal place on the flange (m a direction), cut at 2 sigma.
+        eih_rotation_noise_deg: Standard deviation of its orientation there (deg), cut at 2 sigma.
         image_noise: Standard deviation of pixel noise (grey levels of 255).
+        image_blur_px: Standard deviation of the Gaussian that pictures are blurred with (px).
         joint_offset_deg: Standard deviation of the encoder zero error (deg), cut at 2 sigma.
         depth_noise_px: Standard deviation of the disparities behind depth pictures (px of a sensor
             640 px wide), which then have steps and holes as well; 0 for true depth.
+        n_strewn: Things that lie around and are not the target: discs of other colours, red squares
+            and half discs, as large as it is.
+        unannounced: The other options come as a surprise: the scenes are the named task's but for
+            what the options change in them, and policies are told the named task's parameters.
     """
 
     vary_light: bool = scene(False)
     vary_colour: bool = scene(False)
     vary_texture: bool = scene(False)
+    light_strength: float = 1.0
+    colour_strength: float = 1.0
+    texture_strength: float = 1.0
+    target_hue_deg: float = 0.0
     eth_position_noise_m: float = scene(0.0)
     eth_rotation_noise_deg: float = scene(0.0)
+    eih_position_noise_m: float = scene(0.0)
+    eih_rotation_noise_deg: float = scene(0.0)
     image_noise: float = scene(0.0)
+    image_blur_px: float = 0.0
     joint_offset_deg: float = scene(0.0)
     depth_noise_px: float = 0.0
+    n_strewn: int = scene(0)
+    unannounced: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -228,11 +251,18 @@ class Spec(Timing, Cameras, Disturbances):
         if isinstance(self.start, tuple):
             _check_joints(self.start)
         self._check_not_negative(
+            "light_strength",
+            "colour_strength",
+            "texture_strength",
             "eth_position_noise_m",
             "eth_rotation_noise_deg",
+            "eih_position_noise_m",
+            "eih_rotation_noise_deg",
             "image_noise",
+            "image_blur_px",
             "joint_offset_deg",
             "depth_noise_px",
+            "n_strewn",
         )
 
     def _check_cameras(self) -> None:
@@ -391,7 +421,11 @@ class Spec(Timing, Cameras, Disturbances):
             "colour": self.vary_colour,
             "texture": self.vary_texture,
             "ETH pose": self.eth_position_noise_m > 0 or self.eth_rotation_noise_deg > 0,
+            "hand-eye error": self.eih_position_noise_m > 0 or self.eih_rotation_noise_deg > 0,
+            "target's hue": self.target_hue_deg != 0,
+            "things around": self.n_strewn > 0,
             "image noise": self.image_noise > 0,
+            "blur": self.image_blur_px > 0,
             "joint offsets": self.joint_offset_deg > 0,
             "latency": self.latency_steps > 0,
             "depth noise": self.depth_noise_px > 0,
@@ -409,6 +443,17 @@ class Spec(Timing, Cameras, Disturbances):
     def reach_m(self) -> float:
         """Largest distance of a goal from the base's axis (m), which scales shaped rewards."""
         return 0.78
+
+    @property
+    def target_size_m(self) -> float:
+        """Diameter of the target, and of what is strewn around it (m)."""
+        return 0.050
+
+    def robustness_axes(self) -> tuple["Axis", ...]:
+        """What a robustness study disturbs; families change what makes no sense for them."""
+        from hvs_suite.tasks.shared import robustness
+
+        return robustness.common_axes(self)
 
     @property
     def further_observations(self) -> Mapping[str, VectorObservation]:

@@ -1,5 +1,6 @@
 """Results of every family are scored, verified and shown alike, each with its own figures."""
 
+import dataclasses
 import re
 from pathlib import Path
 
@@ -9,7 +10,8 @@ from test_result_file import make_result
 
 from hvs_suite.errors import ResultError
 from hvs_suite.eval import leaderboard, protocol
-from hvs_suite.eval.board import tables
+from hvs_suite.eval.board import means
+from hvs_suite.eval.board.markdown import markdown
 from hvs_suite.eval.board.page import page
 from hvs_suite.eval.board.tables import Entry
 from hvs_suite.eval.scoring import comparison, result_file, verification
@@ -126,23 +128,71 @@ BOARD = [
 ]
 
 
-def test_a_family_alone_is_not_sunk_by_the_others_and_a_task_left_out_of_it_is() -> None:
-    entries = [entry(*row) for row in BOARD]
-    table = tables.overall(entries)
-    assert [(row.policy, row.coverage) for row in table] == [
-        ("all-round", "3 of 3"),
-        ("aligns", "1 of 3"),
-        ("picks", "1 of 3"),
+def test_a_mean_is_of_what_there_is_and_says_of_how_much() -> None:
+    table = means.standings([entry(*row) for row in BOARD])
+    # Of six tasks of align, three of track and two of sequence.
+    assert [(row.policy, row.mean.coverage) for row in table] == [
+        ("all-round", "4 of 11"),
+        ("aligns", "2 of 11"),
+        ("picks", "1 of 11"),
     ]
-    # (100 + 60) / 2, 40 and 0 over three families; one family; half of one family's tasks.
-    assert [row.mean for row in table] == pytest.approx([40.0, 80.0, 50.0])
-    assert all(row.low <= row.mean <= row.high for row in table)
-    for text in (tables.markdown(entries), page(entries)):
-        assert re.findall(r"[13] of 3", text)[:3] == ["3 of 3", "1 of 3", "1 of 3"]
+    # (100 + 60) / 2, 40 and 0 over three families; one family; one task.
+    assert [row.mean.value for row in table] == pytest.approx([40.0, 80.0, 100.0])
+    assert all(row.mean.low <= row.mean.value <= row.mean.high for row in table)
+    assert {family: mean.coverage for family, mean in table[0].families.items()} == {
+        "align": "2 of 6",
+        "sequence": "1 of 2",
+        "track": "1 of 3",
+    }
+    assert list(table[1].families) == ["align"]
+
+
+def test_a_missing_result_is_shown_as_missing() -> None:
+    entries = [entry(*row) for row in BOARD]
+    row = next(line for line in markdown(entries).splitlines() if line.startswith("| aligns |"))
+    cells = [cell.strip() for cell in row.strip("|").split("|")]
+    assert cells[2] == "2 of 11"
+    assert cells[4].endswith(", 2 of 6 tasks")
+    assert cells[5:] == ["–", "–"]
+    text = page(entries)
+    assert text.count(" no result</span>") >= 2
+    assert "2 of 6 tasks" in text
+
+
+def test_who_was_scored_on_all_tasks_stands_above_who_was_not() -> None:
+    whole = [entry("whole", task, 0) for task in ("sequence-thesis", "sequence-hard")]
+    entries = [entry("part", "sequence-thesis", 100), *whole]
+    parts = means.parted(means.standings(entries))
+    assert [[row.policy for row in part] for part in parts] == [["whole"], ["part"]]
+    text = page(entries)
+    assert re.findall(r"Scored on .* tasks", text) == 2 * [
+        "Scored on all 2 tasks",
+        "Scored on some of the 2 tasks",
+    ]
+
+
+def test_steps_are_compared_over_families_by_their_geometric_mean() -> None:
+    ratios = {"align-easy": 2.0, "align-hard": 8.0, "track-line": 1.0, "sequence-thesis": None}
+    entries = [
+        dataclasses.replace(entry("a", task, 50), steps_over_expert=ratio)
+        for task, ratio in ratios.items()
+    ]
+    [row] = means.standings(entries)
+    # The root of 2 * 8 is 4, the root of 4 * 1 is 2; who solves nothing has nothing to compare.
+    assert row.steps_over_expert == pytest.approx(2.0)
 
 
 def test_each_task_counts_alike_in_its_family_whatever_the_order_of_entries() -> None:
     entries = [entry(*row) for row in BOARD]
-    assert [(row.policy, row.mean) for row in tables.overall(entries[::-1])] == [
-        (row.policy, row.mean) for row in tables.overall(entries)
+    assert [(row.policy, row.mean) for row in means.standings(entries[::-1])] == [
+        (row.policy, row.mean) for row in means.standings(entries)
     ]
+
+
+def test_a_family_shows_its_figures_beside_success() -> None:
+    text = page([entry("a", "track-line", 50), entry("a", "align-easy", 50)])
+    track = text.partition('id="family-track"')[2].partition("</select>")[0]
+    shown = [title.partition("<")[0] for title in re.findall(r"<option[^>]*>(.*)", track)]
+    assert shown[:2] == ["success", "collisions"]
+    assert {"steps to goal", "RMS position error (mm)", "time inside (%)"} <= set(shown)
+    assert not [title for title in shown if "p95" in title]
