@@ -44,9 +44,7 @@ def tip_of(motion: FlangeMotion, tool_length_m: float) -> FlangeMotion:
     arm = tool_length_m * motion.rotation[:, :, 2]
     turning = motion.jacobian[:, 3:]  # (B, 3, 7)
     linear = motion.jacobian[:, :3] + torch.linalg.cross(turning, arm[:, :, None], dim=1)
-    return FlangeMotion(
-        motion.position + arm, motion.rotation, torch.cat([linear, turning], dim=1)
-    )
+    return FlangeMotion(motion.position + arm, motion.rotation, torch.cat([linear, turning], dim=1))
 
 
 def joint_step(motion: FlangeMotion, offset: Tensor, normal: Tensor) -> Tensor:

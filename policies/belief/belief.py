@@ -210,9 +210,7 @@ class Belief(nn.Module):
         updated = torch.cat([x, P.flatten(1), slope, slope_var.clamp(min=1e-12)], dim=1)
         return updated, forget
 
-    def _look(
-        self, i: int, x: Tensor, P: Tensor, sighting: Tensor, view: View
-    ) -> "_Look":
+    def _look(self, i: int, x: Tensor, P: Tensor, sighting: Tensor, view: View) -> "_Look":
         """A sighting as a ray, and how it fits what is believed."""
         s = sighting.double()
         uv = s[:, UV].clamp(-1.6, 1.6) * view.tan

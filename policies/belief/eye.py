@@ -97,9 +97,7 @@ class Eye(nn.Module):
         with torch.no_grad():
             last.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.0, -3.5, -2.0, 0.0, 0.0, -1.0]))
         n_patch = PATCH_CHANNELS * PATCH_SIZE**2
-        self.judge = nn.Sequential(
-            nn.Linear(2 * channels + n_patch + 5, 128), nn.SiLU(), last
-        )
+        self.judge = nn.Sequential(nn.Linear(2 * channels + n_patch + 5, 128), nn.SiLU(), last)
 
     def forward(self, images: Tensor, goal: Tensor | None = None) -> Tensor:
         """Look.
@@ -165,7 +163,9 @@ def _moments(marginal: Tensor) -> tuple[Tensor, Tensor]:
     return mean, variance.clamp(min=1e-8).sqrt()
 
 
-def sighting_loss(sighting: Tensor, truth: Tensor, normal: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+def sighting_loss(
+    sighting: Tensor, truth: Tensor, normal: Tensor
+) -> tuple[Tensor, dict[str, Tensor]]:
     """Loss of a camera against the projected target.
 
     Centre and size are learned by Huber losses, and their doubts by the likelihood of the errors
@@ -191,15 +191,15 @@ def sighting_loss(sighting: Tensor, truth: Tensor, normal: Tensor) -> tuple[Tens
     size_off = sighting[:, LOG_DIAMETER] - truth[:, 2:3].clamp(min=1e-3).log()
     slope_off = sighting[:, SLOPE] - normal
     parts = {
-        "uv": 10.0 * mean(F.smooth_l1_loss(off, torch.zeros_like(off), beta=0.01, reduction="none")),
+        "uv": 10.0
+        * mean(F.smooth_l1_loss(off, torch.zeros_like(off), beta=0.01, reduction="none")),
         "size": mean(
             F.smooth_l1_loss(size_off, torch.zeros_like(size_off), beta=0.05, reduction="none")
         ),
         "sigma_uv": 0.1 * mean(_doubt(off.detach(), sighting[:, LOG_SIGMA_UV])),
         "sigma_size": 0.1 * mean(_doubt(size_off.detach(), sighting[:, LOG_SIGMA_SIZE])),
         "slope": 0.1 * mean(_doubt(slope_off, sighting[:, LOG_SIGMA_SLOPE])),
-        "visible": 0.3
-        * F.binary_cross_entropy_with_logits(sighting[:, VISIBLE], visible),
+        "visible": 0.3 * F.binary_cross_entropy_with_logits(sighting[:, VISIBLE], visible),
     }
     return sum(parts.values(), torch.zeros(())), parts
 

@@ -108,7 +108,10 @@ class BeliefNetwork(nn.Module):
         self.shape, self.cell = shape, cell
         cameras = tuple(shape.cameras)
         self.eyes = nn.ModuleDict(
-            {n: Eye(c, side, shape.channels, shape.n_goals) for n, (c, side) in shape.cameras.items()}
+            {
+                n: Eye(c, side, shape.channels, shape.n_goals)
+                for n, (c, side) in shape.cameras.items()
+            }
         )
         self.belief = Belief(cameras, cell.period_s)
         self.register_buffer(
@@ -141,9 +144,12 @@ class BeliefNetwork(nn.Module):
             last.weight.mul_(0.1)
             last.bias.zero_()
         self.head = nn.Sequential(
-            nn.Linear(full, hidden), nn.SiLU(),
-            nn.Linear(hidden, hidden), nn.SiLU(),
-            nn.Linear(hidden, hidden), nn.SiLU(),
+            nn.Linear(full, hidden),
+            nn.SiLU(),
+            nn.Linear(hidden, hidden),
+            nn.SiLU(),
+            nn.Linear(hidden, hidden),
+            nn.SiLU(),
             last,
         )
         gains = torch.zeros(1 + n_ways, N_JOINTS)

@@ -7,21 +7,29 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from hvs_suite.policies.belief.belief import Prior, View
-from hvs_suite.policies.network.dataset import GOAL_NORMAL, GOAL_POSITION, TARGET_PREFIX
+from hvs_suite.policies.belief.belief import ACCELERATION, N_MOTION, PLACE, VELOCITY, Prior, View
+from hvs_suite.policies.network.dataset import (
+    EPISODE,
+    GOAL_NORMAL,
+    GOAL_POSITION,
+    GOAL_VELOCITY,
+    TARGET_PREFIX,
+)
 
-GOAL_VELOCITY = "privileged.goal_velocity"
 WIDER = 1.5
 """Variances are so much larger than those of the demonstrations: scenes to come may lie beyond."""
 PLACE_FLOOR_M = 2e-5
-VELOCITY_FLOOR_M_S = 1e-5
+MOTION_FLOOR = 1e-5
+"""Of velocities (m/s) and accelerations (m/s2)."""
 SLOPE_VARIANCE_FLOOR = 1e-7
 """Where all demonstrations are alike, the prior is not quite certain."""
 UNSEEN_SIZE = 0.02
 """Size of a target that a camera never saw (image widths times m)."""
 
 
-def fit_prior(columns: Mapping[str, npt.NDArray[np.float32]], views: Mapping[str, View]) -> Prior:
+def fit_prior(
+    columns: Mapping[str, npt.NDArray[np.generic]], views: Mapping[str, View], period_s: float
+) -> Prior:
     """Fit the prior to recorded frames.
 
     Goals g_i with unit normals n_i are known, and that the target lies on the ray d_i from a
@@ -32,14 +40,17 @@ def fit_prior(columns: Mapping[str, npt.NDArray[np.float32]], views: Mapping[str
 
     The eye in hand tells it, whose place is known where it stands; without one, the eye to hand.
     Looks along the normal do not count, because A_i n_i is 0 there; if there are no others, s is 0.
-    Mean and covariance are those of g_i - s n_i, of the velocities and of the slopes n_xy / n_z,
-    the covariance `WIDER`; a camera's size is the median of apparent diameter times depth.
+    Mean and covariance are those of g_i - s n_i, of the velocities, of their differences from frame
+    to frame and of the slopes n_xy / n_z, the covariance `WIDER`; a camera's size is the median of
+    apparent diameter times depth.
 
     Args:
         columns: ``privileged.goal_position`` and ``privileged.goal_normal`` (n, 3),
-            ``privileged.target_<camera>`` (n, 4) of each camera of the views, and
-            ``privileged.goal_velocity`` (n, 3), without which goals stand still.
+            ``privileged.target_<camera>`` (n, 4) of each camera of the views,
+            ``episode_index`` (n,), and ``privileged.goal_velocity`` (n, 3), without which goals
+            stand still.
         views: Camera name to its pose at each frame, nominal.
+        period_s: Control period (s).
 
     Returns:
         The prior.
@@ -52,12 +63,15 @@ def fit_prior(columns: Mapping[str, npt.NDArray[np.float32]], views: Mapping[str
     teller = "eih" if "eih" in views else next(iter(views))
     standoff = _standoff(goal, normal, targets[teller], views[teller])
     place = goal - standoff * normal
-    covariance = torch.zeros(6, 6, dtype=torch.float64)
+    covariance = torch.zeros(N_MOTION, N_MOTION, dtype=torch.float64)
     off = place - place.mean(dim=0)
-    covariance[:3, :3] = WIDER * off.T @ off / len(off)
+    covariance[PLACE, PLACE] = WIDER * off.T @ off / len(off)
     # About zero, where the belief begins.
-    covariance[3:, 3:] = WIDER * velocity.T @ velocity / len(velocity)
-    floors = torch.tensor([PLACE_FLOOR_M] * 3 + [VELOCITY_FLOOR_M_S] * 3, dtype=torch.float64)
+    covariance[VELOCITY, VELOCITY] = WIDER * velocity.T @ velocity / len(velocity)
+    episode = torch.from_numpy(np.asarray(columns[EPISODE], np.int64))
+    change = velocity.diff(dim=0)[episode.diff() == 0] / period_s
+    covariance[ACCELERATION, ACCELERATION] = WIDER * change.T @ change / max(1, len(change))
+    floors = torch.tensor([PLACE_FLOOR_M] * 3 + [MOTION_FLOOR] * 6, dtype=torch.float64)
     slope = normal[:, :2] / normal[:, 2:]
     spread = (slope - slope.mean(dim=0)).square().mean()
     return Prior(
@@ -94,5 +108,5 @@ def _in_view(target: Tensor) -> Tensor:
     return (target[:, 3] > 0.5) & (target[:, :2].abs().amax(dim=1) < 1.0)
 
 
-def _double(column: npt.NDArray[np.float32]) -> Tensor:
+def _double(column: npt.NDArray[np.generic]) -> Tensor:
     return torch.from_numpy(np.asarray(column, np.float64))

@@ -24,6 +24,8 @@ from hvs_suite.tasks.shared.placing import PlacingSpec
 EPISODE = "episode_index"
 GOAL_POSITION = "privileged.goal_position"
 GOAL_NORMAL = "privileged.goal_normal"
+GOAL_VELOCITY = "privileged.goal_velocity"
+VECTOR_PREFIX = "observation."
 TARGET_PREFIX = "privileged.target_"
 JOINTS = "joints"
 
@@ -64,10 +66,15 @@ class Manifest:
 
     @property
     def trained_keys(self) -> list[str]:
-        """The features that training reads: images, state, actions, targets, goal."""
-        wanted = {STATE, ACTION, ACTION_EXECUTED, GOAL_POSITION, GOAL_NORMAL}
+        """The features that training reads: all observations, actions, targets, goal."""
+        wanted = {STATE, ACTION, ACTION_EXECUTED, GOAL_POSITION, GOAL_NORMAL, GOAL_VELOCITY}
         wanted |= {TARGET_PREFIX + name for name in self.cameras}
         wanted |= {IMAGE_PREFIX + name for name in self.cameras}
+        wanted |= {
+            key
+            for key in self.features
+            if key.startswith(VECTOR_PREFIX) and "." not in key.removeprefix(VECTOR_PREFIX)
+        }
         return [key for key in self.features if key in wanted]
 
     def with_inputs(self, names: Collection[str]) -> "Manifest":
