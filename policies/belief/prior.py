@@ -108,5 +108,5 @@ def _in_view(target: Tensor) -> Tensor:
     return (target[:, 3] > 0.5) & (target[:, :2].abs().amax(dim=1) < 1.0)
 
 
-def _double(column: npt.NDArray[np.float32]) -> Tensor:
+def _double(column: npt.NDArray[np.generic]) -> Tensor:
     return torch.from_numpy(np.asarray(column, np.float64))
