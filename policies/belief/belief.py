@@ -96,8 +96,7 @@ class Belief(nn.Module):
         hidden: Width of the network that sets the noises.
     """
 
-    mean: Tensor
-    spread: Tensor
+    prior: Tensor
     standoff: Tensor
     sizes: Tensor
     transition: Tensor

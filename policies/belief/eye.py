@@ -86,11 +86,9 @@ class Eye(nn.Module):
         # A mean over cells cannot reach the border, and strides shift it by a fraction of a cell.
         self.uv_scale = nn.Parameter(torch.full((2,), 1.05))
         self.uv_shift = nn.Parameter(torch.zeros(2))
-        self.first_size = nn.Sequential(
-            nn.Linear(2 * channels + 4, 32), nn.SiLU(), nn.Linear(32, 1)
-        )
-        with torch.no_grad():
-            self.first_size[-1].bias.fill_(math.log(0.15))
+        judge_size = nn.Linear(32, 1)
+        nn.init.constant_(judge_size.bias, math.log(0.15))
+        self.first_size = nn.Sequential(nn.Linear(2 * channels + 4, 32), nn.SiLU(), judge_size)
         self.patch = nn.Linear(channels, PATCH_CHANNELS)
         last = nn.Linear(128, SIGHTING_SIZE)
         nn.init.zeros_(last.weight)

@@ -102,6 +102,9 @@ class BeliefNetwork(nn.Module):
         cell: What is known of the cell.
     """
 
+    joint_range: Tensor
+    joint_speed: Tensor
+
     def __init__(self, shape: Shape, cell: CellModel) -> None:
         super().__init__()
         self.shape, self.cell = shape, cell

@@ -161,7 +161,8 @@ def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy | HvsBelief
         torch.manual_seed(settings.seed)
         make = _new_hvs if settings.policy == "hvs" else _new_hvs_belief
         policy = make(manifest, settings)
-    for eye in policy.network.eyes.values():
+    for module in policy.network.eyes.values():
+        eye: Any = module  # of either kind
         eye.train_in_bfloat16 = torch.cpu._is_avx512_bf16_supported()
     return policy
 

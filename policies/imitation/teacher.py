@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
@@ -12,6 +13,7 @@ from hvs_suite.policies.imitation.settings import Settings
 
 if TYPE_CHECKING:
     from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
+    from hvs_suite.policies.hvs_belief.modeling_hvs_belief import HvsBeliefPolicy
 
 # Philox words that keep this stream apart from others of the same seed.
 REHEARSAL_STREAM = 5
@@ -22,16 +24,11 @@ Parts = dict[str, float]
 
 
 class Teacher(Protocol):
-    """Teaches one policy.
-
-    Attributes:
-        policy: What learns, a LeRobot policy.
-        demonstrations: What it learns from.
-    """
+    """Teaches one policy."""
 
     @property
-    def policy(self) -> nn.Module:
-        """What learns, a LeRobot policy."""
+    def policy(self) -> "HvsPolicy | HvsBeliefPolicy":
+        """What learns."""
 
     @property
     def demonstrations(self) -> Demonstrations:
@@ -46,7 +43,7 @@ class Teacher(Protocol):
     def look_again(self, share: float) -> None:
         """Do what is too dear for every step; what it makes is a function of the weights."""
 
-    def lesson(self, rows: np.ndarray, step: int) -> tuple[Tensor, Parts]:
+    def lesson(self, rows: npt.NDArray[np.int64], step: int) -> tuple[Tensor, Parts]:
         """Loss to learn from, and what it is made of.
 
         Args:
@@ -88,7 +85,7 @@ class FrameTeacher:
     def look_again(self, share: float) -> None:
         """Nothing."""
 
-    def lesson(self, rows: np.ndarray, step: int) -> tuple[Tensor, Parts]:
+    def lesson(self, rows: npt.NDArray[np.int64], step: int) -> tuple[Tensor, Parts]:
         """As `Teacher.lesson`."""
         taught = self.policy.supervise(self.demonstrations.batch(rows))
         if not self._settings.rehearsal_frames:
