@@ -1,10 +1,12 @@
 """Teaches a network with a belief: its eyes from frames, the rest from windows of control steps.
 
-Every step learns from some frames with their images, and from windows of what the eyes have made
-of all frames. They look at all of them again now and then, because that is dear: it is what makes
-the belief learn from the errors that these eyes make.
+The training falls into parts, one more than there are DAgger rounds. In each of them the eyes learn
+first, as far as `EYE_SHARE` of it, from frames; then they look at all frames, and belief and head
+learn from windows of what they saw. So the belief learns of the errors that these very eyes make,
+and what plays the next round has eyes and a belief that know each other.
 """
 
+import bisect
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +19,7 @@ from hvs_suite.policies.belief.lessons import eye_lesson, window_lesson
 from hvs_suite.policies.belief.network import N_JOINTS
 from hvs_suite.policies.belief.prior import fit_prior
 from hvs_suite.policies.belief.recorded import recorded, recorded_keys
+from hvs_suite.policies.imitation.dagger import round_shares
 from hvs_suite.policies.imitation.demonstrations import Demonstrations
 from hvs_suite.policies.imitation.settings import Settings
 from hvs_suite.policies.imitation.teacher import HELD_OUT_BATCH, HELD_OUT_FRAMES, Parts
@@ -28,9 +31,8 @@ from hvs_suite.policies.network.network import STATE
 if TYPE_CHECKING:
     from hvs_suite.policies.hvs_belief.modeling_hvs_belief import HvsBeliefPolicy
 
-FIRST_LOOK = 0.15
-"""Until this part of the training the eyes learn alone: what they see means nothing yet."""
-LAST_LOOK = 0.90
+EYE_SHARE = 0.5
+"""Of each part of the training: the eyes' own."""
 RECALL_SHARE = 0.05
 """How often the belief goes through all episodes again."""
 WINDOW_STREAM = 6
@@ -61,11 +63,15 @@ class WindowTeacher:
         self._file = folder / SEEN
         config = policy.config
         self._windows = WindowPool(demonstrations, config.goal_key, config.wrench_key)
+        self._bounds = [0.0, *round_shares(settings.dagger_rounds), 1.0]
+        self._looked_in = -1
+        """Part of the training in which the eyes looked at all frames last."""
         self._due = 0.0
         self._opened = False
+        self._eyes_learn = True
 
     def clipped_apart(self) -> list[list[nn.Parameter]]:
-        """The eyes, and the rest: they learn from different things."""
+        """The eyes, and the rest: they learn in turns."""
         eyes = list(self.policy.network.eyes.parameters())
         known = {id(parameter) for parameter in eyes}
         return [eyes, [p for p in self.policy.parameters() if id(p) not in known]]
@@ -74,33 +80,39 @@ class WindowTeacher:
         """Whether eyes or belief are to go through everything again."""
         if not self._opened:
             self._reopen(share)
-        has_more = 0 < self._windows.n_looked_at < len(self.demonstrations)
-        return has_more or share >= max(self._due, FIRST_LOOK)
+        part, self._eyes_learn = self._part(share)
+        return not self._eyes_learn and (part > self._looked_in or share >= self._due)
+
+    def _part(self, share: float) -> tuple[int, bool]:
+        """Which part of the training this is, and whether it is the eyes' turn."""
+        part = min(bisect.bisect_right(self._bounds, share) - 1, len(self._bounds) - 2)
+        begin, end = self._bounds[part : part + 2]
+        return part, share < begin + EYE_SHARE * (end - begin)
 
     def _reopen(self, share: float) -> None:
         """Go on with what a killed run saw last, if it has gone so far."""
         self._opened = True
         kept = self._windows.reopen(self._file, self.policy.network) if share > 0.0 else None
         if kept is not None:
-            self._due = _next_due(kept)
+            self._looked_in, self._due = self._part(kept)[0], _next_due(kept)
 
     def look_again(self, share: float) -> None:
-        """Look at all frames again if there are new ones, or it is time to; recall all episodes."""
-        network = self.policy.network
+        """Look at all frames once in each part of the training; recall all episodes."""
+        network, (part, _) = self.policy.network, self._part(share)
         self.policy.eval()
-        is_new = self._windows.n_looked_at < len(self.demonstrations)
-        if is_new or self._due < LAST_LOOK <= share:
+        if part > self._looked_in:
             self._windows.look(network)
         else:
             self._windows.recall(network)
         self.policy.train()
         self._windows.keep(self._file, share)
-        self._due = _next_due(share)
+        self._looked_in, self._due = part, _next_due(share)
 
     def lesson(self, rows: Rows, step: int) -> tuple[Tensor, Parts]:
         """As `Teacher.lesson`."""
-        loss, parts = self._eye_lesson(rows)
-        if self._windows.n_looked_at:
+        if self._eyes_learn:
+            loss, parts = self._eye_lesson(rows)
+        else:
             key = np.random.Philox(key=[self._settings.seed, WINDOW_STREAM], counter=step)
             window = self._windows.draw(
                 self.policy.network,
@@ -109,8 +121,7 @@ class WindowTeacher:
                 self._settings.window_steps,
                 np.random.Generator(key),
             )
-            more, further = window_lesson(self.policy.network, window)
-            loss, parts = loss + more, {**parts, **further}
+            loss, parts = window_lesson(self.policy.network, window)
         return loss, {name: part.item() for name, part in parts.items()}
 
     def _eye_lesson(self, rows: Rows) -> tuple[Tensor, dict[str, Tensor]]:
