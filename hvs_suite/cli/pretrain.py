@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from hvs_suite.cli import console
 from hvs_suite.cli.players import Players
@@ -40,6 +40,10 @@ class Pretrain(Players):
             and logarithmically above; five times the task's tightest tolerance by default.
         eyes: Policy to begin with the eyes of, where a target is too small for fresh ones to find:
             a checkpoint folder, or a named task for the weights shipped for it.
+        policy: Which policy to train: hvs, which knows targets on a level surface, or hvs_belief,
+            which learns from any family's demonstrations.
+        windows: Windows of control steps a step that belief and head of hvs_belief learn from.
+        window_steps: Length of each.
         seed: Of initial weights, held-out episodes and order.
     """
 
@@ -55,6 +59,9 @@ class Pretrain(Players):
     keypoint_weight: float = 1.0
     error_scale: float | None = None
     eyes: str | None = None
+    policy: Literal["hvs", "hvs_belief"] = "hvs"
+    windows: int = 48
+    window_steps: int = 16
     seed: int = 0
 
     def run(self) -> None:
@@ -78,6 +85,9 @@ class Pretrain(Players):
                 keypoint_weight=self.keypoint_weight,
                 error_scale=self.error_scale,
                 eyes=None if self.eyes is None else _folder(self.eyes),
+                policy=self.policy,
+                windows=self.windows,
+                window_steps=self.window_steps,
                 workers=self.players(local=2),
                 seed=self.seed,
                 on_progress=lambda state: update(state.stage, state.share, _words(state)),

@@ -4,12 +4,13 @@
 
 LeRobot finds the type by the distribution ``lerobot_env_hvs`` (in ``integrations/``), or, without
 it, by ``--env.discover_packages_path=hvs_suite.lerobot_env``. Importing this package registers the
-type, and that of the suite's own policy with it: LeRobot does not accept
+type, and those of the suite's own policies with it: LeRobot does not accept
 ``--policy.discover_packages_path`` beside ``--policy.path``. It imports LeRobot, which takes some
 seconds.
 """
 
-import hvs_suite.policies.hvs  # noqa: F401 - registers the policy's type
+import hvs_suite.policies.hvs
+import hvs_suite.policies.hvs_belief  # noqa: F401 - they register the policies' types
 from hvs_suite.lerobot_env.configuration import HvsEnvConfig
 
 __all__ = ["HvsEnvConfig"]

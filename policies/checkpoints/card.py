@@ -117,7 +117,8 @@ def describe(
         f"# hvs policy for {settings['task']}",
         "",
         "Two camera images and the joints in, seven joint position targets out: a LeRobot policy "
-        "of type `hvs` that brings the flange of a simulated KUKA LBR iiwa 7 to its target.",
+        f"of type `{config['type']}` that brings the tool of a simulated KUKA LBR iiwa 7 to its "
+        "target.",
         "",
         f"![Losses and rounds of the training](training/{PICTURE})",
         "",

@@ -1,8 +1,8 @@
 """Plays a checkpoint folder, ours or any other LeRobot policy's, in an environment.
 
-A checkpoint of type `hvs` whose processors are the standard identity ones is played by its network
-alone: LeRobot's policies take ten seconds and a gigabyte to import, in every worker. Tests hold
-that both ways give the same action. Anything else goes through LeRobot.
+A checkpoint of type `hvs` or `hvs_belief` whose processors are the standard identity ones is played
+by its network alone: LeRobot's policies take ten seconds and a gigabyte to import, in every worker.
+Tests hold that both ways give the same action. Anything else goes through LeRobot.
 """
 
 import dataclasses
@@ -15,9 +15,12 @@ import numpy as np
 import numpy.typing as npt
 import pydantic
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hvs_suite.errors import PolicyError, first_line
+from hvs_suite.policies.belief.acting import CompiledBelief
+from hvs_suite.policies.belief.network import BeliefNetwork
+from hvs_suite.policies.belief.settings import Settings
 from hvs_suite.policies.checkpoints.files import (
     MOST_SIZE,
     POSTPROCESSOR,
@@ -39,7 +42,7 @@ from hvs_suite.policies.network.network import (
     HvsNetwork,
     shape_from_config,
 )
-from hvs_suite.policies.trained_for import check_trained_for
+from hvs_suite.policies.trained_for import OURS, check_trained_for
 from hvs_suite.rollout import Observation, one_torch_thread
 from hvs_suite.tasks.shared.spec import Spec
 
@@ -107,8 +110,9 @@ class CheckpointPolicy:
         check_fit(config, folder, spec)
         self._inputs = tuple(config["input_features"])
         with one_torch_thread():
-            if config.get("type") == "hvs" and _processors_are_standard(folder):
-                self._decide, self._forget = _network(folder, config)
+            alone = _ALONE.get(config["type"]) if _processors_are_standard(folder) else None
+            if alone is not None:
+                self._decide, self._forget = alone(folder, config)
             else:
                 self._decide, self._forget = _lerobot(folder)
         self._sentence = spec.instruction()
@@ -189,7 +193,7 @@ def _one(
 def check_fit(config: Mapping[str, Any], folder: Path, spec: Spec) -> None:
     """Check that a task shows what a checkpoint reads, in the same size, and takes its actions.
 
-    One of type `hvs` also has to be trained for such tasks; see `check_trained_for`.
+    One of ours also has to be trained for such tasks; see `check_trained_for`.
 
     Args:
         config: Of the checkpoint.
@@ -199,7 +203,7 @@ def check_fit(config: Mapping[str, Any], folder: Path, spec: Spec) -> None:
     Raises:
         PolicyError: It does not fit.
     """
-    if config.get("type") == "hvs":
+    if config.get("type") in OURS:
         check_trained_for(config, folder, spec)
     shown = spec.observed
     mismatch = f"{folder} does not fit {spec.name}: "
@@ -275,19 +279,34 @@ def load_network(folder: Path, config: Mapping[str, Any]) -> HvsNetwork:
     Raises:
         PolicyError: It cannot be loaded.
     """
+    read_settings(_Sizes, folder)
+    return _with_weights(folder, lambda: HvsNetwork(shape_from_config(config)))
+
+
+def load_belief_network(folder: Path) -> BeliefNetwork:
+    """Load the network of an `hvs_belief` checkpoint, without LeRobot.
+
+    Args:
+        folder: The checkpoint, which `read_config` has checked.
+
+    Raises:
+        PolicyError: It cannot be loaded.
+    """
+    return _with_weights(folder, read_settings(Settings, folder).network)
+
+
+def _with_weights[Network: nn.Module](folder: Path, make: Callable[[], Network]) -> Network:
+    """A network with the weights of a checkpoint, in evaluation mode."""
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
-    read_settings(_Sizes, folder)
-    check_weights(folder, lambda: HvsNetwork(shape_from_config(config)), NETWORK_PREFIX)
+    check_weights(folder, make, NETWORK_PREFIX)
     try:
-        network = HvsNetwork(shape_from_config(config))
+        network = make()
         weights = load_file(folder / WEIGHTS)
         network.load_state_dict({k.removeprefix(NETWORK_PREFIX): v for k, v in weights.items()})
     except (SafetensorError, OSError, RuntimeError) as error:
-        raise PolicyError(
-            f"{folder} cannot be loaded as an hvs policy: {first_line(error)}"
-        ) from error
+        raise PolicyError(f"{folder} cannot be loaded: {first_line(error)}") from error
     return network.eval()
 
 
@@ -305,19 +324,50 @@ def weights_digest(folder: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _network(folder: Path, config: Mapping[str, Any]) -> tuple[Decide, Callable[[], None]]:
+Player = tuple[Decide, Callable[[], None]]
+"""What decides, and what forgets the last episode."""
+
+
+def _network(folder: Path, config: Mapping[str, Any]) -> Player:
     """Play the network of an `hvs` checkpoint by itself."""
     network = load_network(folder, config)
     if not network.shape.state_dim:
         return lambda batch: network.to_action(network(*_one(network, batch)).out, None), _nothing
     compiled = CompiledNetwork(network)
-    memory: Tensor | None = None
 
-    def decide(batch: dict[str, Tensor]) -> Tensor:
-        nonlocal memory
+    def step(batch: Batch, memory: Tensor | None) -> tuple[Tensor, Tensor]:
         images, state = _one(network, batch)
         assert state is not None
-        action, memory = compiled(images, state, memory)
+        return compiled(images, state, memory)
+
+    return _remembering(step)
+
+
+def _belief(folder: Path, config: Mapping[str, Any]) -> Player:
+    """Play the network of an `hvs_belief` checkpoint by itself."""
+    network = load_belief_network(folder)
+    compiled = CompiledBelief(network)
+    goal, wrench = config["goal_key"], config["wrench_key"]
+
+    def step(batch: Batch, memory: Tensor | None) -> tuple[Tensor, Tensor]:
+        return compiled(
+            {name: batch[IMAGE_PREFIX + name][None] for name in network.shape.cameras},
+            batch[STATE][None],
+            memory,
+            None if goal is None else batch[goal][None],
+            None if wrench is None else batch[wrench][None],
+        )
+
+    return _remembering(step)
+
+
+def _remembering(step: Callable[[Batch, Tensor | None], tuple[Tensor, Tensor]]) -> Player:
+    """Keep the memory between the steps of a network."""
+    memory: Tensor | None = None
+
+    def decide(batch: Batch) -> Tensor:
+        nonlocal memory
+        action, memory = step(batch, memory)
         return action
 
     def forget() -> None:
@@ -331,14 +381,22 @@ def _nothing() -> None:
     """Forget nothing: a policy without joints has no memory."""
 
 
-def _lerobot(folder: Path) -> tuple[Decide, Callable[[], None]]:
+_ALONE: Mapping[str, Callable[[Path, Mapping[str, Any]], Player]] = {
+    "hvs": _network,
+    "hvs_belief": _belief,
+}
+"""Types of policies whose networks are played without LeRobot."""
+
+
+def _lerobot(folder: Path) -> Player:
     """Load any LeRobot policy with its processors, on the CPU."""
     try:
         from lerobot.configs import PreTrainedConfig
         from lerobot.policies.factory import get_policy_class, make_pre_post_processors
     except ImportError as error:
         raise PolicyError("LeRobot is missing; install hvs-suite[learn]") from error
-    import hvs_suite.policies.hvs  # noqa: F401 - registers the type
+    import hvs_suite.policies.hvs
+    import hvs_suite.policies.hvs_belief  # noqa: F401 - they register the types
 
     try:
         config = PreTrainedConfig.from_pretrained(folder, local_files_only=True)

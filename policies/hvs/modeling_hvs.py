@@ -1,7 +1,6 @@
 """The `hvs` network behind LeRobot's policy interface."""
 
 import dataclasses
-import json
 import logging
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from hvs_suite.errors import DatasetError, OutputError, first_line
+from hvs_suite.errors import DatasetError
 from hvs_suite.policies.hvs.configuration_hvs import HvsConfig
 from hvs_suite.policies.network.dataset import (
     GOAL_NORMAL,
@@ -31,6 +30,7 @@ from hvs_suite.policies.network.network import (
     target_loss,
 )
 from hvs_suite.policies.network.rehearsal import drawn_sightings
+from hvs_suite.policies.training.checkpoint import write_checkpoint
 
 logger = logging.getLogger(__name__)
 
@@ -235,25 +235,6 @@ def save_checkpoint(policy: HvsPolicy, folder: Path) -> None:
     Raises:
         OutputError: It cannot be written; what stood there before still does.
     """
-    import tempfile
-
-    from safetensors import SafetensorError
-
     from hvs_suite.policies.hvs.processor_hvs import make_hvs_pre_post_processors
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".checkpoint-") as name:
-            scratch = Path(name)
-            policy.save_pretrained(scratch)
-            for processor in make_hvs_pre_post_processors(policy.config):
-                processor.save_pretrained(scratch)
-            # LeRobot reads the type before it knows the class; keep the file stable for diffs.
-            config = json.loads((scratch / "config.json").read_text())
-            (scratch / "config.json").write_text(
-                json.dumps(config, indent=2, sort_keys=True) + "\n"
-            )
-            for path in sorted(scratch.iterdir()):
-                path.replace(folder / path.name)
-    except (OSError, SafetensorError) as error:
-        raise OutputError(f"cannot write {folder}: {first_line(error)}") from error
+    write_checkpoint(policy, make_hvs_pre_post_processors(policy.config), folder)

@@ -91,6 +91,25 @@ class FramePool:
         )
         return Recording({**recording.columns, MEMORY: memory}, recording.images)
 
+    def columns(self) -> dict[str, Column]:
+        """The numbers of all frames by key, ``episode_index`` counted over all recordings."""
+        keys = [key for key in self._recordings[0].columns if key != EPISODE]
+        whole: dict[str, Column] = {
+            key: np.concatenate([r.columns[key] for r in self._recordings]) for key in keys
+        }
+        begins, lengths = self.episodes()
+        whole[EPISODE] = np.repeat(np.arange(len(begins)), lengths)
+        return whole
+
+    def episodes(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """First frame and length of every episode of all recordings, (n,) each."""
+        begins = []
+        for recording, start in zip(self._recordings, self._starts, strict=True):
+            owner = recording.columns[EPISODE]
+            begins.append(start + np.flatnonzero(np.append(True, owner[1:] != owner[:-1])))
+        first = np.concatenate(begins)
+        return first, np.diff(np.append(first, self._length))
+
     def batch(self, indices: npt.NDArray[np.int64], *, pictures: bool = True) -> dict[str, Tensor]:
         """Frames as LeRobot's loader would give them, but for images left as bytes.
 
@@ -133,6 +152,7 @@ class Demonstrations(FramePool):
         cache: Folder for decoded frames.
         seed: Chooses the held-out episodes.
         episodes: Learn from the first so many alone; None from all.
+        with_memory: Work out what an `HvsNetwork` would remember at each frame.
         on_frames: Called with the number of frames just decoded, over all cameras.
 
     Attributes:
@@ -150,11 +170,12 @@ class Demonstrations(FramePool):
         seed: int,
         *,
         episodes: int | None = None,
+        with_memory: bool = True,
         on_frames: OnFrames | None = None,
     ) -> None:
         columns = read_columns(manifest)
         calibration = None
-        if {STATE, GOAL_POSITION, GOAL_NORMAL} <= set(columns):
+        if with_memory and {STATE, GOAL_POSITION, GOAL_NORMAL} <= set(columns):
             calibration = calibrate_on(manifest, columns, episodes)
         super().__init__(manifest, seed, calibration)
         images: dict[str, Frames] = {}
@@ -175,6 +196,12 @@ class Demonstrations(FramePool):
         shuffled = stream.permutation(names)
         self.training = np.flatnonzero(np.isin(owner, shuffled[n_held_out:]))
         self.held_out = np.flatnonzero(np.isin(owner, shuffled[:n_held_out]))
+
+    @property
+    def episodes_to_learn_from(self) -> npt.NDArray[np.bool_]:
+        """Of all episodes, those whose frames are to be learned from, (n,)."""
+        begins, _ = self.episodes()
+        return np.isin(begins, self.training)
 
     def add(self, recording: Recording) -> None:
         """Learn from more frames, all of them.

@@ -29,6 +29,8 @@ from hvs_suite.policies.imitation.settings import (
     take_eyes,
 )
 from hvs_suite.policies.imitation.state import Counters, load_state, save_state
+from hvs_suite.policies.imitation.teacher import FrameTeacher, Teacher
+from hvs_suite.policies.imitation.window_teacher import WindowTeacher, set_prior
 from hvs_suite.policies.network.dataset import Manifest, read_manifest, refuse_test_split
 from hvs_suite.policies.training.budget import Budget
 from hvs_suite.policies.training.curves import Curves
@@ -37,16 +39,14 @@ from hvs_suite.policies.training.process import prepare_process
 from hvs_suite.policies.training.run_folder import claimed, write_train_config
 
 if TYPE_CHECKING:
-    from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy, Lesson
+    from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
+    from hvs_suite.policies.hvs_belief.modeling_hvs_belief import HvsBeliefPolicy
 
 PACKAGES = ("hvs-suite", "lerobot", "numpy", "torch")
 WARMUP_SHARE = 0.03
 GRADIENT_NORM = 1.0
 # Philox words that keep this stream apart from the held-out choice.
 ORDER_STREAM = 2
-REHEARSAL_STREAM = 5
-HELD_OUT_BATCH = 128
-HELD_OUT_FRAMES = 512
 LOG_EVERY_STEPS = 20
 
 
@@ -83,7 +83,6 @@ class Outcome:
         step: Optimiser steps, over all sittings.
         train_s: Training time, over all sittings (s).
         decode_s: Time spent decoding frames in this sitting (s).
-        data_s: Part of the training time of this sitting spent waiting for batches (s).
         play_s: Time spent on DAgger rounds in this sitting (s).
         rounds: What the DAgger rounds came to.
         frames_per_s: Frames trained on a second in this sitting.
@@ -95,7 +94,6 @@ class Outcome:
     step: int
     train_s: float
     decode_s: float
-    data_s: float
     play_s: float
     rounds: tuple[RoundSummary, ...]
     frames_per_s: float
@@ -162,7 +160,7 @@ def pretrain(
             data=str(data),
             options=dict(manifest.options),
             policy={
-                "type": "hvs",
+                "type": policy.config.type,
                 "channels": policy.config.channels,
                 "hidden": policy.config.hidden,
                 "weight_decay": policy.config.optimizer_weight_decay,
@@ -171,8 +169,7 @@ def pretrain(
         run = _Run(out, on_progress)
         demonstrations = run.decode(manifest, training / "cache", chosen)
         run.train(
-            policy,
-            demonstrations,
+            _teacher(policy, demonstrations, chosen, training),
             chosen,
             budget=budget,
             rounds=_Rounds(
@@ -181,6 +178,19 @@ def pretrain(
             checkpoint_period_s=checkpoint_period_s,
         )
         return run.finish(policy)
+
+
+def _teacher(
+    policy: "HvsPolicy | HvsBeliefPolicy",
+    demonstrations: Demonstrations,
+    settings: Settings,
+    folder: Path,
+) -> Teacher:
+    """Who teaches a fresh policy."""
+    if settings.policy == "hvs":
+        return FrameTeacher(policy, demonstrations, settings)
+    set_prior(policy, demonstrations)
+    return WindowTeacher(policy, demonstrations, settings, folder)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -204,7 +214,6 @@ class _Run:
         self._out = out
         self._on_progress = on_progress
         self._decode_s = 0.0
-        self._data_s = 0.0
         self._play_s = 0.0
         self._rounds: list[RoundSummary] = []
         self._frames = 0
@@ -222,6 +231,7 @@ class _Run:
             cache,
             settings.seed,
             episodes=settings.episodes,
+            with_memory=settings.policy == "hvs",
             on_frames=self._meter("decoding", total),
         )
         self._decode_s = time.perf_counter() - started
@@ -229,8 +239,7 @@ class _Run:
 
     def train(
         self,
-        policy: "HvsPolicy",
-        demonstrations: Demonstrations,
+        teacher: Teacher,
         settings: Settings,
         *,
         budget: Budget,
@@ -240,6 +249,7 @@ class _Run:
         """Train until the budget is used up; the last checkpoint is the final one."""
         state = self._out / "training" / "state.safetensors"
         rate, batch_size = settings.learning_rate, settings.batch_size
+        policy, demonstrations = teacher.policy, teacher.demonstrations
         decay = policy.config.optimizer_weight_decay
         optimizer = torch.optim.AdamW(policy.parameters(), lr=rate, weight_decay=decay)
         self._counters = load_state(state, policy, optimizer)
@@ -258,20 +268,20 @@ class _Run:
             while (share := self._share(budget)) < 1.0:
                 if len(self._rounds) < len(due) and share >= due[len(self._rounds)]:
                     paused = time.perf_counter()
-                    self._checkpoint(policy, optimizer, demonstrations, state, curves)
+                    self._checkpoint(teacher, optimizer, state, curves)
                     self._play_round(demonstrations, rounds)
                     order = _Order(demonstrations.training, batch_size, settings.seed)
                     pause = time.perf_counter() - paused
                     started, last_checkpoint = started + pause, time.perf_counter()
                     self._play_s += pause
                 step = self._counters.step
+                if teacher.is_due(share):
+                    self._checkpoint(teacher, optimizer, state, curves)
+                    teacher.look_again(share)
                 step_rate = rate * _schedule(share)
                 for group in optimizer.param_groups:
                     group["lr"] = step_rate
-                fetched = time.perf_counter()
-                batch = demonstrations.batch(order.indices(step))
-                self._data_s += time.perf_counter() - fetched
-                loss, parts = self._step(policy, optimizer, batch, demonstrations, settings)
+                loss, parts = self._step(teacher, optimizer, order.indices(step))
 
                 recent = [*recent[1 - LOG_EVERY_STEPS :], loss]
                 self._loss = sum(recent) / len(recent)
@@ -287,10 +297,10 @@ class _Run:
                         self._counters.step,
                     )
                 if now - last_checkpoint >= checkpoint_period_s:
-                    self._checkpoint(policy, optimizer, demonstrations, state, curves)
+                    self._checkpoint(teacher, optimizer, state, curves)
                     last_checkpoint = time.perf_counter()
                 self._report_training(self._share(budget), begun)
-            self._checkpoint(policy, optimizer, demonstrations, state, curves)
+            self._checkpoint(teacher, optimizer, state, curves)
         finally:
             curves.close()
 
@@ -299,14 +309,9 @@ class _Run:
         return budget.share(self._counters.step, self._counters.elapsed_s)
 
     def _step(
-        self,
-        policy: "HvsPolicy",
-        optimizer: torch.optim.Optimizer,
-        batch: dict[str, torch.Tensor],
-        demonstrations: Demonstrations,
-        settings: Settings,
+        self, teacher: Teacher, optimizer: torch.optim.Optimizer, rows: npt.NDArray[np.int64]
     ) -> tuple[float, dict[str, float]]:
-        """Learn from a batch, and from frames of which the head alone learns.
+        """Learn from some frames, and what the teacher adds to them.
 
         Returns:
             The loss, and what it is made of.
@@ -315,15 +320,14 @@ class _Run:
             PolicyError: It is no number any more.
         """
         step = self._counters.step
-        lesson = policy.supervise(batch)
-        loss, parts = lesson.loss, lesson.parts
-        if settings.rehearsal_frames:
-            extra = _rehearse(policy, demonstrations, lesson, settings, step)
-            parts["rehearsal_loss"] = extra.item()
-            loss = loss + extra
+        loss, parts = teacher.lesson(rows, step)
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), GRADIENT_NORM)
+        norms = [
+            torch.nn.utils.clip_grad_norm_(together, GRADIENT_NORM)
+            for together in teacher.clipped_apart()
+        ]
+        norm = torch.stack(norms).norm()
         # Before the step: a weight that is no number would spread through all the others.
         if not math.isfinite(loss.item()) or not math.isfinite(norm.item()):
             raise PolicyError(
@@ -334,13 +338,12 @@ class _Run:
         optimizer.step()
         return loss.item(), parts
 
-    def finish(self, policy: "HvsPolicy") -> Outcome:
+    def finish(self, policy: torch.nn.Module) -> Outcome:
         """What the sitting came to, written and drawn."""
         outcome = Outcome(
             step=self._counters.step,
             train_s=self._counters.elapsed_s,
             decode_s=self._decode_s,
-            data_s=self._data_s,
             play_s=self._play_s,
             rounds=tuple(self._rounds),
             frames_per_s=self._frames / max(1e-9, self._sitting_s),
@@ -379,20 +382,13 @@ class _Run:
         self._reopen(demonstrations, folder)
 
     def _checkpoint(
-        self,
-        policy: "HvsPolicy",
-        optimizer: torch.optim.Optimizer,
-        demonstrations: Demonstrations,
-        state: Path,
-        curves: Curves,
+        self, teacher: Teacher, optimizer: torch.optim.Optimizer, state: Path, curves: Curves
     ) -> None:
-        from hvs_suite.policies.hvs.modeling_hvs import save_checkpoint
-
-        parts = _held_out(policy, demonstrations)
+        parts = teacher.held_out()
         self._held_out_loss = parts.get("loss", math.nan)
         curves.add({f"held_out/{name}": v for name, v in parts.items()}, self._counters.step)
-        save_state(state, policy, optimizer, self._counters)
-        save_checkpoint(policy, self._out)
+        save_state(state, teacher.policy, optimizer, self._counters)
+        teacher.save(self._out)
 
     def _meter(self, stage: str, total: int) -> Callable[[int], None]:
         """Counts the frames of a stage and reports its rate and time left."""
@@ -462,41 +458,7 @@ class _Order:
         return self._shuffled
 
 
-def _rehearse(
-    policy: "HvsPolicy",
-    demonstrations: Demonstrations,
-    lesson: "Lesson",
-    settings: Settings,
-    step: int,
-) -> torch.Tensor:
-    """Loss of the head on frames of this step's own draw, whose images stay on the disk."""
-    key = np.random.Philox(key=[settings.seed, REHEARSAL_STREAM], counter=step)
-    random = np.random.Generator(key)
-    indices = random.choice(demonstrations.training, settings.rehearsal_frames)
-    generator = torch.Generator().manual_seed(int(random.integers(2**32)))
-    return policy.rehearse(demonstrations.batch(indices, pictures=False), lesson, generator)
-
-
 def _schedule(share: float) -> float:
     """Learning rate as a share of its peak: linear warm-up, then half a cosine to zero."""
     warm = min(1.0, (share + 1e-3) / WARMUP_SHARE)
     return warm * 0.5 * (1.0 + math.cos(math.pi * min(1.0, share)))
-
-
-def _held_out(policy: "HvsPolicy", demonstrations: Demonstrations) -> dict[str, float]:
-    """Mean losses over held-out frames spread over their episodes; empty if there are none."""
-    indices = demonstrations.held_out
-    if not len(indices):
-        return {}
-    spread = np.linspace(0, len(indices) - 1, min(len(indices), HELD_OUT_FRAMES))
-    indices = indices[spread.astype(np.int64)]
-    sums: dict[str, float] = {}
-    policy.eval()
-    with torch.no_grad():
-        for first in range(0, len(indices), HELD_OUT_BATCH):
-            part = indices[first : first + HELD_OUT_BATCH]
-            loss, parts = policy(demonstrations.batch(part))
-            for name, value in {"loss": loss.item(), **parts}.items():
-                sums[name] = sums.get(name, 0.0) + value * len(part)
-    policy.train()
-    return {name: value / len(indices) for name, value in sums.items()}

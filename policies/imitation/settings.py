@@ -10,17 +10,27 @@ import torch
 from torch import nn
 
 from hvs_suite.datasets.features import ACTION_EXECUTED
-from hvs_suite.errors import OptionError, PolicyError
+from hvs_suite.errors import DatasetError, OptionError, PolicyError
+from hvs_suite.policies.belief.cell_model import cell_model
+from hvs_suite.policies.belief.settings import as_numbers, further_keys
 from hvs_suite.policies.checkpoints.files import read_config
-from hvs_suite.policies.checkpoints.loading import load_network, weights_digest
+from hvs_suite.policies.checkpoints.loading import (
+    load_belief_network,
+    load_network,
+    weights_digest,
+)
 from hvs_suite.policies.imitation.frame_cache import fingerprint
 from hvs_suite.policies.network.dataset import Manifest, calibration_of
-from hvs_suite.policies.network.network import IMAGE_PREFIX, STATE, Eye
+from hvs_suite.policies.network.network import IMAGE_PREFIX, STATE
 from hvs_suite.policies.trained_for import trained_for
 from hvs_suite.registry import find
 
 if TYPE_CHECKING:
     from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
+    from hvs_suite.policies.hvs_belief.modeling_hvs_belief import HvsBeliefPolicy
+
+
+POLICIES = ("hvs", "hvs_belief")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -43,6 +53,10 @@ class Settings:
         keypoint_weight: Weight of the supervision by ``privileged.*``; 0 trains on actions alone.
         error_scale: See `HvsConfig`.
         eyes: SHA-256 of the weights whose eyes it begins with; None for fresh ones.
+        policy: Type of the policy: ``hvs`` or ``hvs_belief``.
+        windows: Windows of control steps that belief and head of ``hvs_belief`` learn from in a
+            step.
+        window_steps: Length of each.
     """
 
     seed: int = 0
@@ -58,6 +72,9 @@ class Settings:
     keypoint_weight: float = 1.0
     error_scale: float
     eyes: str | None = None
+    policy: str = "hvs"
+    windows: int = 48
+    window_steps: int = 16
 
     def check(self, manifest: Manifest) -> None:
         """Refuse numbers that make no sense.
@@ -68,7 +85,14 @@ class Settings:
         Raises:
             OptionError: There is one.
         """
-        for name in ("batch_size", "dagger_frames"):
+        if self.policy not in POLICIES:
+            raise OptionError(f"policy is {self.policy!r}; choose from {', '.join(POLICIES)}")
+        if self.policy == "hvs_belief":
+            # What only the other one knows.
+            for name in ("rehearsal_frames", "keypoint_weight"):
+                if getattr(self, name) != getattr(type(self), name):
+                    raise OptionError(f"{name} is of policy hvs, not of hvs_belief; leave it out")
+        for name in ("batch_size", "dagger_frames", "windows", "window_steps"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not 0.0 < self.learning_rate < 1.0:
@@ -122,49 +146,91 @@ def trails_its_set_point(manifest: Manifest) -> bool:
     return task.latency_steps > 0 and ACTION_EXECUTED in manifest.features
 
 
-def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":
-    """A fresh policy for a dataset's inputs, its cameras calibrated from what it is to learn from.
+def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy | HvsBeliefPolicy":
+    """A fresh policy for a dataset's inputs; an `hvs` one calibrated from what it is to learn from.
 
     Args:
         manifest: Of the dataset, with the inputs that the policy is to have.
         settings: Of the run.
-    """
-    from lerobot.configs import FeatureType, PolicyFeature
 
+    Raises:
+        DatasetError: The policy needs inputs that the dataset does not have.
+    """
+    # torch initialises weights from its global generator; leave that as it was found.
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(settings.seed)
+        make = _new_hvs if settings.policy == "hvs" else _new_hvs_belief
+        policy = make(manifest, settings)
+    for module in policy.network.eyes.values():
+        eye: Any = module  # of either kind
+        eye.train_in_bfloat16 = torch.cpu._is_avx512_bf16_supported()
+    return policy
+
+
+def _new_hvs(manifest: Manifest, settings: Settings) -> "HvsPolicy":
     from hvs_suite.policies.hvs.configuration_hvs import HvsConfig
     from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
+
+    inputs = _inputs(manifest, [STATE])
+    config = HvsConfig(
+        **_common(manifest, settings, inputs),
+        keypoint_weight=settings.keypoint_weight,
+        from_set_point=STATE in inputs and trails_its_set_point(manifest),
+    )
+    policy = HvsPolicy(config)
+    if STATE in manifest.features:
+        policy.network.set_calibration(calibration_of(manifest.root, settings.episodes))
+    return policy
+
+
+def _new_hvs_belief(manifest: Manifest, settings: Settings) -> "HvsBeliefPolicy":
+    from hvs_suite.policies.hvs_belief.configuration_hvs_belief import HvsBeliefConfig
+    from hvs_suite.policies.hvs_belief.modeling_hvs_belief import HvsBeliefPolicy
+
+    vectors = [key for key in further_keys(manifest.features) if key is not None]
+    task = find(manifest.task).with_options(manifest.options)
+    config = HvsBeliefConfig(
+        **_common(manifest, settings, _inputs(manifest, [STATE, *vectors])),
+        cell=as_numbers(cell_model(task)),
+        window=settings.window_steps,
+    )
+    try:
+        return HvsBeliefPolicy(config)
+    except ValueError as error:
+        raise DatasetError(f"{manifest.root} does not do for hvs_belief: {error}") from error
+
+
+def _inputs(manifest: Manifest, vectors: list[str]) -> dict[str, Any]:
+    """What a policy is given of a dataset, in LeRobot's words."""
+    from lerobot.configs import FeatureType, PolicyFeature
 
     inputs = {
         IMAGE_PREFIX + name: PolicyFeature(FeatureType.VISUAL, (shape[2], shape[0], shape[1]))
         for name, shape in manifest.cameras.items()
     }
-    if STATE in manifest.features:
-        shape = tuple(manifest.features[STATE]["shape"])
-        inputs[STATE] = PolicyFeature(FeatureType.STATE, shape)
-    config = HvsConfig(
-        input_features=inputs,
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},
-        device="cpu",
-        push_to_hub=False,
-        optimizer_lr=settings.learning_rate,
-        keypoint_weight=settings.keypoint_weight,
-        error_scale=settings.error_scale,
-        from_set_point=STATE in inputs and trails_its_set_point(manifest),
+    for key in vectors:
+        if key in manifest.features:
+            kind = FeatureType.STATE if key == STATE else FeatureType.ENV
+            inputs[key] = PolicyFeature(kind, tuple(manifest.features[key]["shape"]))
+    return inputs
+
+
+def _common(manifest: Manifest, settings: Settings, inputs: dict[str, Any]) -> dict[str, Any]:
+    """What the configurations of both policies say."""
+    from lerobot.configs import FeatureType, PolicyFeature
+
+    return {
+        "input_features": inputs,
+        "output_features": {"action": PolicyFeature(FeatureType.ACTION, (7,))},
+        "device": "cpu",
+        "push_to_hub": False,
+        "optimizer_lr": settings.learning_rate,
+        "error_scale": settings.error_scale,
         **trained_for(find(manifest.task).with_options(manifest.options)).model_dump(),
-    )
-    # torch initialises weights from its global generator; leave that as it was found.
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(settings.seed)
-        policy = HvsPolicy(config)
-    if STATE in manifest.features:
-        policy.network.set_calibration(calibration_of(manifest.root, settings.episodes))
-    for module in policy.modules():
-        if isinstance(module, Eye):
-            module.train_in_bfloat16 = torch.cpu._is_avx512_bf16_supported()
-    return policy
+    }
 
 
-def take_eyes(policy: "HvsPolicy", folder: Path) -> None:
+def take_eyes(policy: "HvsPolicy | HvsBeliefPolicy", folder: Path) -> None:
     """Begin with the eyes of another policy, for each camera whose layers are alike.
 
     Eyes that found larger targets find smaller ones soon; fresh ones may never get to see a target
@@ -172,16 +238,17 @@ def take_eyes(policy: "HvsPolicy", folder: Path) -> None:
 
     Args:
         policy: Whose eyes to replace.
-        folder: Checkpoint of an `hvs` policy.
+        folder: Checkpoint of a policy of the same type.
 
     Raises:
         PolicyError: It is none, or no camera has the same layers in both.
     """
     config = read_config(folder)
-    if config.get("type") != "hvs":
-        raise PolicyError(f"{folder} holds a policy of type {config.get('type')}, not hvs")
-    others = load_network(folder, config).eyes
-    eyes = policy.network.eyes
+    kind = policy.config.type
+    if config.get("type") != kind:
+        raise PolicyError(f"{folder} holds a policy of type {config.get('type')}, not {kind}")
+    loaded = load_network(folder, config) if kind == "hvs" else load_belief_network(folder)
+    others, eyes = loaded.eyes, policy.network.eyes
     alike = [
         name for name in eyes if name in others and _shapes(eyes[name]) == _shapes(others[name])
     ]

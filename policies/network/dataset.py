@@ -24,6 +24,8 @@ from hvs_suite.tasks.shared.placing import PlacingSpec
 EPISODE = "episode_index"
 GOAL_POSITION = "privileged.goal_position"
 GOAL_NORMAL = "privileged.goal_normal"
+GOAL_VELOCITY = "privileged.goal_velocity"
+VECTOR_PREFIX = "observation."
 TARGET_PREFIX = "privileged.target_"
 JOINTS = "joints"
 
@@ -64,10 +66,15 @@ class Manifest:
 
     @property
     def trained_keys(self) -> list[str]:
-        """The features that training reads: images, state, actions, targets, goal."""
-        wanted = {STATE, ACTION, ACTION_EXECUTED, GOAL_POSITION, GOAL_NORMAL}
+        """The features that training reads: all observations, actions, targets, goal."""
+        wanted = {STATE, ACTION, ACTION_EXECUTED, GOAL_POSITION, GOAL_NORMAL, GOAL_VELOCITY}
         wanted |= {TARGET_PREFIX + name for name in self.cameras}
         wanted |= {IMAGE_PREFIX + name for name in self.cameras}
+        wanted |= {
+            key
+            for key in self.features
+            if key.startswith(VECTOR_PREFIX) and "." not in key.removeprefix(VECTOR_PREFIX)
+        }
         return [key for key in self.features if key in wanted]
 
     def with_inputs(self, names: Collection[str]) -> "Manifest":
@@ -148,14 +155,25 @@ def refuse_test_split(manifest: Manifest) -> None:
         )
 
 
-def read_columns(manifest: Manifest) -> dict[str, Column]:
-    """Read the columns that training uses: state, actions, targets, goal, episode.
+def read_columns(manifest: Manifest, wanted: Collection[str] | None = None) -> dict[str, Column]:
+    """Read columns of numbers.
+
+    Args:
+        manifest: Of the dataset.
+        wanted: Their keys; by default those that training uses: state, actions, targets, goal.
 
     Returns:
         Key to (n_frames, k) float32; ``episode_index`` to (n_frames,) int64.
+
+    Raises:
+        DatasetError: They are not there, or damaged.
     """
-    keys = [key for key in manifest.trained_keys if not key.startswith(IMAGE_PREFIX)]
-    if ACTION not in keys or not manifest.cameras:
+    keys = [
+        key
+        for key in (manifest.trained_keys if wanted is None else wanted)
+        if not key.startswith(IMAGE_PREFIX)
+    ]
+    if wanted is None and (ACTION not in keys or not manifest.cameras):
         raise DatasetError(f"{manifest.root} needs an action and at least one camera to learn from")
     parts: dict[str, list[Column]] = {key: [] for key in [*keys, EPISODE]}
     for path in reader.data_files(manifest.root):

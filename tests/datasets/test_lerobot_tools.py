@@ -18,6 +18,8 @@ from hub_server import running_hub
 from hvs_suite.cli.main import run
 from hvs_suite.datasets.archive import unpack
 from hvs_suite.datasets.check import check_dataset
+from hvs_suite.policies.checkpoints.loading import CheckpointPolicy
+from hvs_suite.registry import TASKS
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "align-thesis"
 BIN = Path(sys.executable).parent
@@ -129,6 +131,26 @@ def test_act_trains_for_a_few_steps_and_is_scored(tmp_path):
         "checkpoint",
         2,
     )
+
+
+def test_our_policy_trains_on_windows_resumes_and_is_played_without_lerobot(tmp_path):
+    discover = "--policy.discover_packages_path=hvs_suite.policies.hvs_belief"
+    out = tmp_path / "belief"
+    done = call(
+        tmp_path, "lerobot-train", discover, "--policy.type=hvs_belief",
+        "--dataset.repo_id=local/sample", f"--dataset.root={SAMPLE}", "--policy.device=cpu",
+        "--policy.push_to_hub=false", "--policy.window=3", "--policy.channels=8",
+        "--policy.hidden=32", "--num_workers=0", "--batch_size=2", "--steps=2", "--log_freq=1",
+        "--env_eval_freq=0", "--wandb.enable=false", f"--output_dir={out}",
+    )  # fmt: skip
+    assert_done(done)
+    checkpoint = out / "checkpoints/last/pretrained_model"
+    before = (checkpoint / "model.safetensors").read_bytes()
+    settings = f"--config_path={checkpoint / 'train_config.json'}"
+    done = call(tmp_path, "lerobot-train", discover, settings, "--resume=true", "--steps=3")
+    assert_done(done)
+    assert (checkpoint / "model.safetensors").read_bytes() != before
+    CheckpointPolicy(checkpoint, TASKS["align-thesis"])
 
 
 def test_hub_gets_every_file_and_nobody_sees_the_token(tmp_path):

@@ -1,0 +1,148 @@
+"""Steps and postures that bring the tool's tip to a place and an axis; the arm's own geometry.
+
+Fixed and differentiable where it says so. Base frame, metres. The tool points against the goal's
+normal; turning about it is free. Nothing in here knows a task.
+"""
+
+import torch
+from torch import Tensor
+
+from hvs_suite.cell.robot import (
+    BASE_TO_SHOULDER_M,
+    ELBOW_TO_WRIST_M,
+    JOINT_RANGE_RAD,
+    JOINT_SPEED_RAD_S,
+    SHOULDER_TO_ELBOW_M,
+    WRIST_TO_FLANGE_M,
+)
+from hvs_suite.policies.network.geometry import FlangeMotion
+
+DAMPING_M = 0.03
+"""Of the least-squares inverse: small against the arm's 0.4 m links, large enough to keep steps
+bounded where the arm is stretched."""
+LINEAR_RANGE_M = 0.10
+LINEAR_RANGE_RAD = 0.30
+"""Errors are shortened to this before the inverse, which only holds near by."""
+LEVER_M = 0.2
+"""Angles weigh like the offsets that they cause so far away."""
+UNREACHABLE_S = 100.0
+"""Added to the time of a way that leads out of the joint ranges."""
+
+
+def tip_of(motion: FlangeMotion, tool_length_m: float) -> FlangeMotion:
+    """The motion of the tip of a tool that stands on the flange, along its axis.
+
+    Args:
+        motion: Of the flange.
+        tool_length_m: From the flange to the tip (m).
+
+    Returns:
+        The same at the tip.
+    """
+    if tool_length_m == 0.0:
+        return motion
+    arm = tool_length_m * motion.rotation[:, :, 2]
+    turning = motion.jacobian[:, 3:]  # (B, 3, 7)
+    linear = motion.jacobian[:, :3] + torch.linalg.cross(turning, arm[:, :, None], dim=1)
+    return FlangeMotion(motion.position + arm, motion.rotation, torch.cat([linear, turning], dim=1))
+
+
+def joint_step(motion: FlangeMotion, offset: Tensor, normal: Tensor) -> Tensor:
+    """Damped least-squares step that moves the tip by an offset and turns it to face a normal.
+
+    Solves ``J^T (J J^T + d^2 I)^-1 e`` with the three position rows and the two tilt rows of the
+    Jacobian; turning about the tool's axis is free (Nakamura and Hanafusa, 1986).
+
+    Args:
+        motion: Of the tip. No gradient flows through it.
+        offset: From the tip to where it should be, (B, 3) m; gradients flow.
+        normal: Unit normal that it should face, (B, 3). No gradient flows through it.
+
+    Returns:
+        Joint step, (B, 7) rad.
+    """
+    with torch.no_grad():
+        tool = motion.rotation[:, :, 2]
+        axis = torch.linalg.cross(tool, -normal, dim=1)
+        sine = axis.norm(dim=1, keepdim=True)
+        angle = torch.atan2(sine, -(tool * normal).sum(dim=1, keepdim=True))
+        tilt = axis * (angle.clamp(max=LINEAR_RANGE_RAD) / sine.clamp(min=1e-6))
+        into_flange = motion.rotation.transpose(1, 2)[:, :2]
+        turning = LEVER_M * into_flange @ motion.jacobian[:, 3:]
+        rows = torch.cat([motion.jacobian[:, :3], turning], dim=1)
+        gram = rows @ rows.transpose(1, 2)
+        gram = gram + DAMPING_M**2 * torch.eye(5, dtype=gram.dtype, device=gram.device)
+        inverse = torch.linalg.solve(gram, rows).transpose(1, 2)  # (B, 7, 5)
+        tilt_in_flange = LEVER_M * (into_flange @ tilt[:, :, None])[:, :, 0]
+    length = offset.norm(dim=1, keepdim=True)
+    near = offset * (LINEAR_RANGE_M / length.clamp(min=LINEAR_RANGE_M))
+    error = torch.cat([near, tilt_in_flange], dim=1)
+    return (inverse @ error[:, :, None])[:, :, 0]
+
+
+def postures(flange: Tensor, normal: Tensor) -> Tensor:
+    """The two plain postures that hold the flange at a place, facing a normal.
+
+    Shoulder, elbow and wrist stand in one upright plane, the elbow above: a planar arm of two
+    links, by the law of cosines; A5 and A6 then turn the tool. A1 turns that plane towards the
+    wrist, or away from it with all angles of the plane the other way round. Out of reach, the arm
+    is stretched that way.
+
+    Args:
+        flange: Where it should be, (B, 3) m. No gradient flows through it.
+        normal: Unit normal that it should face, (B, 3). No gradient flows through it.
+
+    Returns:
+        Angles of A1 to A6, (B, 2, 6) rad, A1 and A5 in [-pi, pi]; joint ranges are not looked at.
+    """
+    with torch.no_grad():
+        upper, fore = SHOULDER_TO_ELBOW_M, ELBOW_TO_WRIST_M
+        wrist = flange + WRIST_TO_FLANGE_M * normal
+        out = wrist[:, :2].norm(dim=1)
+        up = wrist[:, 2] - BASE_TO_SHOULDER_M
+        reach2 = (out**2 + up**2).clamp(max=(upper + fore) ** 2)
+        bend = torch.arccos(((reach2 - upper**2 - fore**2) / (2.0 * upper * fore)).clamp(-1.0, 1.0))
+        lean = torch.atan2(fore * torch.sin(bend), upper + fore * torch.cos(bend))
+        shoulder = torch.atan2(out, up) - lean
+        towards = torch.atan2(wrist[:, 1], wrist[:, 0])
+        away = towards + torch.where(towards > 0, -torch.pi, torch.pi)
+        zero = torch.zeros_like(out)
+        both = []
+        for a1, sign in ((towards, 1.0), (away, -1.0)):
+            # The tool's axis as the forearm's frame has it.
+            c, s = torch.cos(a1), torch.sin(a1)
+            x = -(c * normal[:, 0] + s * normal[:, 1])
+            y = -(c * normal[:, 1] - s * normal[:, 0])
+            z = -normal[:, 2]
+            lean_over = sign * (shoulder + bend)
+            cl, sl = torch.cos(lean_over), torch.sin(lean_over)
+            across, along = cl * x - sl * z, sl * x + cl * z
+            a6 = sign * torch.atan2(torch.hypot(across, y), along)
+            a5 = torch.atan2(sign * y, sign * across)
+            both.append(torch.stack([a1, sign * shoulder, zero, -sign * bend, a5, a6], dim=1))
+        return torch.stack(both, dim=1)
+
+
+def way_to_posture(q: Tensor, flange: Tensor, normal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The way to the nearer of the two plain postures that lie within the joint ranges.
+
+    Nearer is where the slowest joint arrives first at full speed.
+
+    Args:
+        q: Joint angles, (B, 7) rad.
+        flange: Where it should be, (B, 3) m. No gradient flows through it.
+        normal: Unit normal that it should face, (B, 3). No gradient flows through it.
+
+    Returns:
+        The turns of A1 to A6 that are left, (B, 6) rad, the time of the slowest, (B, 1) s, and 1 if
+        that posture lies within the ranges, else 0, (B, 1).
+    """
+    speed = torch.as_tensor(JOINT_SPEED_RAD_S[:-1]).to(q)
+    limit = torch.as_tensor(JOINT_RANGE_RAD[:-1]).to(q)
+    ends = postures(flange, normal)
+    ways = ends - q[:, None, :-1]
+    times = (ways.abs() / speed).amax(dim=2)
+    within = (ends.abs() <= limit).all(dim=2)
+    nearer = torch.where(within, times, times + UNREACHABLE_S).argmin(dim=1)
+    row = torch.arange(len(q), device=q.device)
+    return ways[row, nearer], times[row, nearer, None], within[row, nearer, None].to(q)

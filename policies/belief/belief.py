@@ -1,0 +1,332 @@
+"""The belief: what the robot thinks the goal is, as a Kalman filter with learned noises.
+
+The state is the target's place, velocity and acceleration, Gaussian with a full covariance, and
+the slope of the surface there. Where targets lie is a prior that comes from the demonstrations:
+targets that all lie on one level have a flat one, and a ray meets it as it would meet a plane. A
+sighting is a ray, on which the target's size says how far away it is. How far to trust each of
+them, how much a target may have moved, and when to forget it because it is suddenly elsewhere, a
+small network decides from how well what is seen fits what was believed.
+
+Double precision: variances of a tenth of a millimetre and of half a metre meet in one matrix.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor, nn
+
+from hvs_suite.policies.belief.eye import (
+    LOG_DIAMETER,
+    LOG_SIGMA_SIZE,
+    LOG_SIGMA_SLOPE,
+    LOG_SIGMA_UV,
+    SLOPE,
+    UV,
+    VISIBLE,
+)
+
+N_MOTION = 9
+"""Numbers of the state that move: place (m), velocity (m/s) and acceleration (m/s2)."""
+BELIEF_SIZE = N_MOTION + N_MOTION**2 + 2 + 1
+PLACE, VELOCITY, ACCELERATION, MOTION, COVARIANCE, TILT, TILT_VARIANCE = (
+    slice(0, 3),
+    slice(3, 6),
+    slice(6, 9),
+    slice(0, N_MOTION),
+    slice(N_MOTION, BELIEF_SIZE - 3),
+    slice(BELIEF_SIZE - 3, BELIEF_SIZE - 1),
+    slice(BELIEF_SIZE - 1, BELIEF_SIZE),
+)
+"""Where these, the covariance of the first three, and the slope and its variance stand."""
+MAX_DEPTH_M = 3.5
+MIN_DEPTH_M = 0.02
+GATES_A_CAMERA = 4
+GATES = 4
+"""Of all cameras: forgetting, and how much place, motion and slope may have changed."""
+FORGET_SLOPE = 5.0
+FORGET_AT = 3.2
+"""A share of 1e-7 is forgotten where the gate says 0: of half a metre, a tenth of a millimetre."""
+FEATURES_A_CAMERA = 9
+FEATURES = 12
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Prior:
+    """Where targets are before anything is seen, and how the cameras show them.
+
+    Attributes:
+        place: Mean, (3,) m.
+        covariance: Of place, velocity and acceleration, (9, 9).
+        slope: Mean of the normal's x and y over its z, (2,).
+        slope_variance: Of each.
+        standoff_m: From the target along its normal to the goal of the tip (m).
+        sizes: Camera name to apparent diameter (image widths) times depth (m).
+    """
+
+    place: Tensor
+    covariance: Tensor
+    slope: Tensor
+    slope_variance: float
+    standoff_m: float
+    sizes: Mapping[str, float]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class View:
+    """A camera's pose at one moment, nominal, by the measured joints.
+
+    Attributes:
+        origin: (B, 3) m.
+        rotation: Optical axes as columns, (B, 3, 3).
+        tan: Tangent of half the field of view.
+    """
+
+    origin: Tensor
+    rotation: Tensor
+    tan: float
+
+
+class Belief(nn.Module):
+    """The filter.
+
+    Args:
+        cameras: Their names.
+        period_s: Control period (s).
+        hidden: Width of the network that sets the noises.
+    """
+
+    prior: Tensor
+    standoff: Tensor
+    sizes: Tensor
+    transition: Tensor
+
+    def __init__(self, cameras: tuple[str, ...], period_s: float, hidden: int = 64) -> None:
+        super().__init__()
+        self.cameras = cameras
+        n = len(cameras)
+        start = torch.zeros(BELIEF_SIZE, dtype=torch.float64)
+        start[COVARIANCE] = torch.diag(
+            torch.tensor([0.25] * 3 + [1e-8] * 6, dtype=torch.float64)
+        ).flatten()
+        start[TILT_VARIANCE] = 1e-4
+        self.register_buffer("prior", start)
+        self.register_buffer("standoff", torch.tensor(0.05, dtype=torch.float64))
+        self.register_buffer("sizes", torch.full((n,), 0.02, dtype=torch.float64))
+        eye3 = torch.eye(3, dtype=torch.float64)
+        transition = torch.eye(N_MOTION, dtype=torch.float64)
+        transition[PLACE, VELOCITY] = transition[VELOCITY, ACCELERATION] = period_s * eye3
+        transition[PLACE, ACCELERATION] = 0.5 * period_s**2 * eye3
+        self.register_buffer("transition", transition, persistent=False)
+        # Floors of what cameras tell: angle (rad), place (m), share of a distance, slope.
+        floors = torch.tensor([2e-3, 5e-4, 0.01, 0.01]).log().repeat(n, 1)
+        self.log_floors = nn.Parameter(floors)
+        last = nn.Linear(hidden, GATES_A_CAMERA * n + GATES)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.gate = nn.Sequential(
+            nn.Linear(FEATURES_A_CAMERA * n + FEATURES, hidden), nn.SiLU(), last
+        )
+
+    def set_prior(self, prior: Prior) -> None:
+        """Copy a prior into the buffers that are saved with the weights."""
+        self.prior[PLACE] = prior.place
+        self.prior[3:N_MOTION] = 0.0
+        self.prior[COVARIANCE] = prior.covariance.flatten()
+        self.prior[TILT] = prior.slope
+        self.prior[TILT_VARIANCE] = prior.slope_variance
+        self.standoff.fill_(prior.standoff_m)
+        for i, name in enumerate(self.cameras):
+            self.sizes[i] = prior.sizes[name]
+
+    def start(self, n: int) -> Tensor:
+        """What is believed before anything is seen, (n, k) float64."""
+        return self.prior.expand(n, BELIEF_SIZE).clone()
+
+    def forward(
+        self, belief: Tensor, sightings: Mapping[str, Tensor], views: Mapping[str, View]
+    ) -> tuple[Tensor, Tensor]:
+        """One control step: what was believed goes on, and what is seen is taken in.
+
+        Args:
+            belief: (B, k) float64.
+            sightings: Camera name to (B, 9) of its eye.
+            views: Camera name to its pose.
+
+        Returns:
+            What is believed now, (B, k), and the gates in (0, 1) that say how much was forgotten,
+            (B, 1).
+        """
+        n = len(belief)
+        F = self.transition
+        x = belief[:, MOTION] @ F.T
+        P = F @ belief[:, COVARIANCE].view(n, N_MOTION, N_MOTION) @ F.T
+        slope, slope_var = belief[:, TILT], belief[:, TILT_VARIANCE]
+        looks = [self._look(i, x, P, sightings[c], views[c]) for i, c in enumerate(self.cameras)]
+        features = [look.features for look in looks]
+        variances = torch.diagonal(P, dim1=1, dim2=2).clamp(min=1e-14)
+        features.append(
+            torch.cat([0.2 * variances.log(), 0.2 * slope_var.log(), slope], dim=1).float()
+        )
+        gates = self.gate(torch.cat(features, dim=1)).double()
+        common = gates[:, -GATES:]
+        forget = torch.sigmoid(FORGET_SLOPE * (common[:, :1] - FORGET_AT))
+        keep = 1.0 - forget
+        start = self.prior
+        prior_P = start[COVARIANCE].view(N_MOTION, N_MOTION)
+        x = keep * x + forget * start[MOTION]
+        P = keep[:, :, None] * P + forget[:, :, None] * prior_P
+        prior_variance = torch.diagonal(prior_P)
+        change = torch.exp(common[:, 1:].clamp(-6.0, 6.0))
+        q = torch.cat(
+            [1e-10 * change[:, :1].expand(n, 3), prior_variance[3:] * 1e-3 * change[:, 1:2]],
+            dim=1,
+        )
+        P = P + torch.diag_embed(q)
+        slope = keep * slope + forget * start[TILT]
+        slope_var = keep * slope_var + forget * start[TILT_VARIANCE] + 1e-8 * change[:, 2:]
+        # What the cameras say of the place, as information.
+        info = P.new_zeros(n, 3, 3)
+        vector = P.new_zeros(n, 3)
+        for i, look in enumerate(looks):
+            gate = gates[:, GATES_A_CAMERA * i : GATES_A_CAMERA * (i + 1)]
+            Lambda, point = self._measure(i, look, x, P, gate)
+            info = info + Lambda
+            vector = vector + (Lambda @ (point - x[:, :3])[:, :, None])[:, :, 0]
+        eye3 = torch.eye(3, dtype=P.dtype)
+        middle = torch.linalg.inv(eye3 + info @ P[:, :3, :3])  # (I + L P)^-1
+        gain = P[:, :, :3] @ middle  # (B, 9, 3), acts on information
+        x = x + (gain @ vector[:, :, None])[:, :, 0]
+        P = P - gain @ info @ P[:, :3, :]
+        P = 0.5 * (P + P.transpose(1, 2)) + 1e-13 * torch.eye(N_MOTION, dtype=P.dtype)
+        for i, look in enumerate(looks):
+            gate = gates[:, GATES_A_CAMERA * i : GATES_A_CAMERA * (i + 1)]
+            seen, variance = self._facing(i, look, gate)
+            share = slope_var / (slope_var + variance)
+            slope = slope + share * (seen - slope)
+            slope_var = slope_var * (1.0 - share)
+        updated = torch.cat([x, P.flatten(1), slope, slope_var.clamp(min=1e-12)], dim=1)
+        return updated, forget
+
+    def _look(self, i: int, x: Tensor, P: Tensor, sighting: Tensor, view: View) -> "_Look":
+        """A sighting as a ray, and how it fits what is believed."""
+        s = sighting.double()
+        uv = s[:, UV].clamp(-1.6, 1.6) * view.tan
+        ray = torch.cat([uv, torch.ones_like(uv[:, :1])], dim=1)
+        length = ray.norm(dim=1, keepdim=True)
+        direction = (view.rotation @ (ray / length)[:, :, None])[:, :, 0]
+        by_size = self.sizes[i] * torch.exp(-s[:, LOG_DIAMETER].clamp(-6.0, 1.0)) * length
+        by_size = by_size.clamp(MIN_DEPTH_M, MAX_DEPTH_M)
+        offset = x[:, :3] - view.origin
+        along = (offset * direction).sum(dim=1, keepdim=True)
+        miss = offset - along * direction
+        miss_m = miss.norm(dim=1, keepdim=True)
+        spread = torch.diagonal(P[:, :3, :3], dim1=1, dim2=2).sum(dim=1, keepdim=True).sqrt()
+        sigma_m = s[:, LOG_SIGMA_UV].exp() * view.tan * by_size
+        doubt = torch.sqrt(spread**2 + sigma_m**2)
+        visible = s[:, VISIBLE]
+        features = torch.cat(
+            [
+                torch.tanh(visible / 4.0),
+                torch.tanh(visible / 20.0),
+                0.3 * s[:, LOG_SIGMA_UV],
+                0.3 * s[:, LOG_SIGMA_SIZE],
+                0.3 * s[:, LOG_SIGMA_SLOPE],
+                0.3 * by_size.log(),
+                0.2 * torch.log(miss_m / doubt + 1e-3),
+                0.2 * torch.log(miss_m + 1e-4),
+                (along / by_size - 1.0).clamp(-2.0, 2.0),
+            ],
+            dim=1,
+        )
+        return _Look(s, view, direction, length, by_size, features.float())
+
+    def _measure(
+        self, i: int, look: "_Look", x: Tensor, P: Tensor, gate: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """What a ray says of the place: information (B, 3, 3), and the point on it (B, 3)."""
+        s, d = look.sighting, look.direction
+        log_floors = self.log_floors[i].double()
+        loud = torch.exp(2.0 * torch.tanh(gate[:, :3] / 2.0) * 2.0)  # of variances, e^-4 to e^4
+        share_var = (s[:, LOG_SIGMA_SIZE].exp() ** 2 + log_floors[2].exp() ** 2) * loud[:, 1:2]
+        # Where the ray is most likely met: by what was believed, and by the size.
+        believed = torch.linalg.inv(P[:, :3, :3])
+        Pd = (believed @ d[:, :, None])[:, :, 0]
+        weight = (Pd * d).sum(dim=1, keepdim=True)
+        at = (Pd * (x[:, :3] - look.view.origin)).sum(dim=1, keepdim=True)
+        size_weight = 1.0 / (share_var * look.by_size**2)
+        depth = (at + size_weight * look.by_size) / (weight + size_weight)
+        depth = depth.clamp(MIN_DEPTH_M, MAX_DEPTH_M).detach()
+        angle = s[:, LOG_SIGMA_UV].exp() * look.view.tan / look.length
+        across_var = ((angle**2 + log_floors[0].exp() ** 2) * depth**2) * loud[:, :1]
+        across_var = across_var + log_floors[1].exp() ** 2
+        along_var = share_var * look.by_size**2 + log_floors[1].exp() ** 2
+        there = torch.sigmoid(s[:, VISIBLE] + gate[:, 3:])
+        outer = d[:, :, None] * d[:, None]
+        eye3 = torch.eye(3, dtype=P.dtype)
+        info = (eye3 - outer) / across_var[:, :, None] + outer / along_var[:, :, None]
+        return there[:, :, None] ** 2 * info, look.view.origin + look.by_size * d
+
+    def _facing(self, i: int, look: "_Look", gate: Tensor) -> tuple[Tensor, Tensor]:
+        """What a sighting says of the slope (B, 2), and its variance (B, 1)."""
+        s = look.sighting
+        xy = s[:, SLOPE].clamp(-0.95, 0.95)
+        z = -torch.sqrt((1.0 - xy.square().sum(dim=1, keepdim=True)).clamp(min=0.05))
+        normal = (look.view.rotation @ torch.cat([xy, z], dim=1)[:, :, None])[:, :, 0]
+        up = normal[:, 2:]
+        slope = (normal[:, :2] / up.clamp(min=0.2)).clamp(-1.5, 1.5)
+        floor = self.log_floors[i, 3].double().exp()
+        variance = s[:, LOG_SIGMA_SLOPE].clamp(-7.0, 2.0).exp() ** 2 + floor**2
+        variance = variance * torch.exp(4.0 * torch.tanh(gate[:, 2:3] / 2.0))
+        there = torch.sigmoid(s[:, VISIBLE] + gate[:, 3:]) * (up > 0.2)
+        return slope, variance / (there**2 + 1e-9)
+
+    def normal(self, belief: Tensor) -> Tensor:
+        """Unit normal of the surface at the target, (B, 3)."""
+        slope = belief[:, TILT]
+        n = torch.cat([slope, torch.ones_like(slope[:, :1])], dim=1)
+        return n / n.norm(dim=1, keepdim=True)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Look:
+    sighting: Tensor
+    view: View
+    direction: Tensor
+    length: Tensor
+    by_size: Tensor
+    features: Tensor
+
+
+def belief_loss(
+    belief: Tensor, place: Tensor, velocity: Tensor, slope: Tensor, scale_m: float
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """How likely the truth is by what is believed, and how far off its mean is.
+
+    Args:
+        belief: (n, k).
+        place: (n, 3) m.
+        velocity: (n, 3) m/s.
+        slope: (n, 2).
+        scale_m: Errors below this weigh linearly, above logarithmically (m).
+
+    Returns:
+        Scalar, and its parts.
+    """
+    n = len(belief)
+    off = torch.cat([place - belief[:, PLACE], velocity - belief[:, VELOCITY]], dim=1).double()
+    P = belief[:, COVARIANCE].view(n, N_MOTION, N_MOTION)[:, :3, :3]
+    e = off[:, :3]
+    squared = (e * (torch.linalg.inv(P) @ e[:, :, None])[:, :, 0]).sum(dim=1)
+    place_nll = 0.5 * torch.logdet(P) + 3.5 * torch.log1p(squared / 4.0)
+    slope_var = belief[:, TILT_VARIANCE][:, 0]
+    slope_off = (slope - belief[:, TILT]).square().sum(dim=1)
+    slope_nll = slope_var.log() + 3.0 * torch.log1p(slope_off / slope_var / 4.0)
+    parts = {
+        "place": torch.asinh(e.abs() / scale_m).mean(),
+        "place_nll": 0.05 * place_nll.mean(),
+        "velocity": 0.3 * torch.asinh(off[:, 3:].abs() / (10.0 * scale_m)).mean(),
+        "slope_nll": 0.05 * slope_nll.mean(),
+        "slope": 0.3 * torch.asinh((slope - belief[:, TILT]).abs() / 0.02).mean(),
+    }
+    return sum(parts.values(), torch.zeros((), dtype=torch.float64)), parts

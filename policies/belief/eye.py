@@ -1,0 +1,213 @@
+"""Eyes: one small encoder a camera, from an image to a sighting of the target.
+
+A softmax over one channel's map is a distribution over the image; its mean is the target's place.
+Features around that place, as far as the target is large, then say the rest: by how much the mean
+is off, how large the target appears, which way it faces, and how sure all of this is.
+"""
+
+import math
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+FEATURE_SIZE = 28
+"""Cells along the side of a feature map, about."""
+PATCH_SIZE = 8
+PATCH_CHANNELS = 16
+PATCH_DIAMETERS = 2.5
+"""The patch around the target reaches so many of its diameters to either side."""
+SIGHTING_SIZE = 9
+UV, LOG_DIAMETER, VISIBLE, LOG_SIGMA_UV, LOG_SIGMA_SIZE, SLOPE, LOG_SIGMA_SLOPE = (
+    slice(0, 2),
+    slice(2, 3),
+    slice(3, 4),
+    slice(4, 5),
+    slice(5, 6),
+    slice(6, 8),
+    slice(8, 9),
+)
+"""What a sighting (B, 9) holds: the target's centre in [-1, 1] (u right, v down), the logarithm of
+its apparent diameter in image widths, the logit that it is in view, x and y of its normal in the
+camera's optical frame, and the logarithms of the standard deviations of these."""
+
+
+def strides(side: int) -> tuple[int, ...]:
+    """Strides of 4, 3 or 2 px that bring an image to about `FEATURE_SIZE` cells.
+
+    Args:
+        side: Side of the square image (px).
+
+    Returns:
+        Strides of the down-sampling convolutions; empty for tiny images.
+    """
+    factor = max(1, round(side / FEATURE_SIZE))
+    plan: list[int] = []
+    while factor > 1:
+        step = 3 if factor % 3 == 0 else 2
+        plan.append(step)
+        factor = round(factor / step)
+    return tuple(sorted(plan, reverse=True))
+
+
+class Eye(nn.Module):
+    """Encoder of one camera.
+
+    Args:
+        in_channels: Channels of the image.
+        side: Side of the image (px).
+        channels: Channels of the features.
+        n_goals: Length of the one-hot vector that says which target is meant; 0 for none.
+
+    Attributes:
+        train_in_bfloat16: Train the convolutions in bfloat16, where the processor is faster at it.
+            Evaluation is always in float32, and so is everything that measures.
+    """
+
+    train_in_bfloat16 = False
+
+    def __init__(self, in_channels: int, side: int, channels: int, n_goals: int = 0) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        width = in_channels
+        plan = strides(side)
+        for i, stride in enumerate(plan):
+            out = channels if i == len(plan) - 1 else max(8, channels >> (len(plan) - 1 - i))
+            size = 5 if i == 0 else 3
+            layers += [nn.Conv2d(width, out, size, stride, size // 2), nn.ReLU(inplace=True)]
+            width = out
+        for _ in range(2):
+            layers += [nn.Conv2d(width, channels, 3, 1, 1), nn.ReLU(inplace=True)]
+            width = channels
+        self.features = nn.Sequential(*layers)
+        self.asked_for = nn.Linear(n_goals, 2 * channels) if n_goals else None
+        self.chosen = nn.Sequential(nn.Linear(channels, channels), nn.ReLU(inplace=True))
+        self.score = nn.Linear(channels, 1)
+        # A mean over cells cannot reach the border, and strides shift it by a fraction of a cell.
+        self.uv_scale = nn.Parameter(torch.full((2,), 1.05))
+        self.uv_shift = nn.Parameter(torch.zeros(2))
+        judge_size = nn.Linear(32, 1)
+        nn.init.constant_(judge_size.bias, math.log(0.15))
+        self.first_size = nn.Sequential(nn.Linear(2 * channels + 4, 32), nn.SiLU(), judge_size)
+        self.patch = nn.Linear(channels, PATCH_CHANNELS)
+        last = nn.Linear(128, SIGHTING_SIZE)
+        nn.init.zeros_(last.weight)
+        with torch.no_grad():
+            last.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.0, -3.5, -2.0, 0.0, 0.0, -1.0]))
+        n_patch = PATCH_CHANNELS * PATCH_SIZE**2
+        self.judge = nn.Sequential(nn.Linear(2 * channels + n_patch + 5, 128), nn.SiLU(), last)
+
+    def forward(self, images: Tensor, goal: Tensor | None = None) -> Tensor:
+        """Look.
+
+        Args:
+            images: (B, C, H, W), uint8, or float in [0, 1].
+            goal: Which target is meant, one-hot (B, n_goals); None for a policy that is not told.
+
+        Returns:
+            The sighting, (B, 9).
+        """
+        maps = self._maps(images, goal)  # (B, h, w, channels)
+        scores = self.score(maps)[..., 0]
+        weights = torch.softmax(scores.flatten(1), dim=1)
+        grid = weights.view_as(scores)
+        u, u_spread = _moments(grid.sum(dim=1))
+        v, v_spread = _moments(grid.sum(dim=2))
+        uv = torch.cat([u, v], dim=1) * self.uv_scale + self.uv_shift
+        flat = maps.flatten(1, 2)
+        pooled = torch.cat([(weights[:, None] @ flat)[:, 0], flat.amax(dim=1)], dim=1)
+        size = self.first_size(torch.cat([pooled, uv, u_spread, v_spread], dim=1))
+        patch = self._around(maps, uv.detach(), size.detach())
+        judged = self.judge(
+            torch.cat([pooled, patch.flatten(1), uv, u_spread, v_spread, size], dim=1)
+        )
+        # A mark that is cut by the image's border has its centre elsewhere than what is in view.
+        return torch.cat([uv + judged[:, UV], size + judged[:, LOG_DIAMETER], judged[:, 3:]], dim=1)
+
+    def _around(self, maps: Tensor, uv: Tensor, log_diameter: Tensor) -> Tensor:
+        """Features around a place, its surroundings scaled by the target's size."""
+        reach = (PATCH_DIAMETERS * 2.0 * log_diameter.exp()).clamp(0.15, 1.2)
+        ticks = torch.linspace(-1.0, 1.0, PATCH_SIZE, device=maps.device)
+        dv, du = torch.meshgrid(ticks, ticks, indexing="ij")
+        offsets = torch.stack([du, dv], dim=2)[None]  # (1, k, k, 2)
+        at = uv[:, None, None] + reach[:, None, None] * offsets
+        narrow = self.patch(maps).permute(0, 3, 1, 2)
+        return F.grid_sample(narrow, at, align_corners=False, padding_mode="zeros")
+
+    def _maps(self, images: Tensor, goal: Tensor | None) -> Tensor:
+        """Features of every cell, (B, h, w, channels)."""
+        half = self.train_in_bfloat16 and self.training
+        if images.dtype == torch.uint8:
+            # Bytes less their mean are exact in bfloat16, and half the size to begin with.
+            x = images.to(torch.bfloat16 if half else torch.float32).sub_(127.5).mul_(1.0 / 255.0)
+        else:
+            x = images - 0.5
+        x = x.contiguous(memory_format=torch.channels_last)
+        with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=half):
+            maps: Tensor = self.features(x)
+        maps = maps.float().permute(0, 2, 3, 1)
+        if self.asked_for is not None and goal is not None:
+            gain, shift = self.asked_for(goal)[:, None, None].chunk(2, dim=3)
+            maps = maps * (1.0 + gain) + shift
+        return self.chosen(maps)
+
+
+def _moments(marginal: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation in [-1, 1] of a distribution over n cells, (B, 1) each."""
+    n = marginal.shape[1]
+    centres = (2.0 * torch.arange(n, device=marginal.device, dtype=marginal.dtype) + 1.0) / n - 1.0
+    mean = (marginal * centres).sum(dim=1, keepdim=True)
+    variance = (marginal * centres**2).sum(dim=1, keepdim=True) - mean**2
+    return mean, variance.clamp(min=1e-8).sqrt()
+
+
+def sighting_loss(
+    sighting: Tensor, truth: Tensor, normal: Tensor
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Loss of a camera against the projected target.
+
+    Centre and size are learned by Huber losses, and their doubts by the likelihood of the errors
+    that remain; the normal and its doubt by the likelihood alone, because most images tell nothing
+    of it.
+
+    Args:
+        sighting: (B, 9).
+        truth: u, v, apparent diameter in image widths, visible 0/1, (B, 4).
+        normal: x and y of the target's normal in the camera's optical frame, (B, 2).
+
+    Returns:
+        Scalar, and what it is made of.
+    """
+    visible = truth[:, 3:]
+    inside = visible * (truth[:, :2].abs().amax(dim=1, keepdim=True) <= 1.1)
+    count = inside.sum().clamp(min=1.0)
+
+    def mean(loss: Tensor) -> Tensor:
+        return (loss * inside).sum() / count
+
+    off = sighting[:, UV] - truth[:, :2]
+    size_off = sighting[:, LOG_DIAMETER] - truth[:, 2:3].clamp(min=1e-3).log()
+    slope_off = sighting[:, SLOPE] - normal
+    parts = {
+        "uv": 10.0
+        * mean(F.smooth_l1_loss(off, torch.zeros_like(off), beta=0.01, reduction="none")),
+        "size": mean(
+            F.smooth_l1_loss(size_off, torch.zeros_like(size_off), beta=0.05, reduction="none")
+        ),
+        "sigma_uv": 0.1 * mean(_doubt(off.detach(), sighting[:, LOG_SIGMA_UV])),
+        "sigma_size": 0.1 * mean(_doubt(size_off.detach(), sighting[:, LOG_SIGMA_SIZE])),
+        "slope": 0.1 * mean(_doubt(slope_off, sighting[:, LOG_SIGMA_SLOPE])),
+        "visible": 0.3 * F.binary_cross_entropy_with_logits(sighting[:, VISIBLE], visible),
+    }
+    return sum(parts.values(), torch.zeros(())), parts
+
+
+def _doubt(error: Tensor, log_sigma: Tensor) -> Tensor:
+    """Negative log-likelihood under Student's t with four degrees of freedom, summed over axes.
+
+    Its long tails keep the few gross errors from drowning the rest.
+    """
+    log_sigma = log_sigma.clamp(-8.0, 2.0)
+    n = error.shape[1]
+    squared = (error / log_sigma.exp()).square().sum(dim=1, keepdim=True)
+    return n * log_sigma + 0.5 * (4.0 + n) * torch.log1p(squared / 4.0)

@@ -1,0 +1,125 @@
+"""Lessons: frames for the eyes, windows of control steps for belief and head.
+
+A frame costs the eyes some seventy times what it costs belief and head. So the eyes learn from
+frames, and belief and head from windows, from what the eyes saw in them.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from hvs_suite.policies.belief.belief import BELIEF_SIZE, View, belief_loss
+from hvs_suite.policies.belief.control_loss import TIP_WEIGHT, action_loss, tip_loss
+from hvs_suite.policies.belief.eye import sighting_loss
+from hvs_suite.policies.belief.network import BEGUN, N_JOINTS, SET_POINT, BeliefNetwork
+from hvs_suite.policies.belief.recorded import Recorded
+from hvs_suite.policies.network import geometry
+
+Parts = dict[str, Tensor]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Window:
+    """B windows of T control steps, each of one episode.
+
+    Attributes:
+        memory: Before the first step, (B, k) float64.
+        sightings: Camera name to (B, T, 9).
+        state: (B, T, 14).
+        action: What the demonstrator would do, (B, T, 7).
+        truth: Of each step, (B, T).
+        felt: Wrench, (B, T, 6); None without.
+        counts: False for steps after the end of the episode, (B, T).
+    """
+
+    memory: Tensor
+    sightings: Mapping[str, Tensor]
+    state: Tensor
+    action: Tensor
+    truth: Recorded
+    felt: Tensor | None
+    counts: Tensor
+
+
+def eye_lesson(
+    network: BeliefNetwork, sightings: Mapping[str, Tensor], q: Tensor, truth: Recorded
+) -> tuple[Tensor, Parts]:
+    """Loss of what the eyes make of frames.
+
+    Args:
+        network: Knows where the cameras are.
+        sightings: Camera name to (B, 9).
+        q: Measured joint positions, (B, 7) rad.
+        truth: Of the frames.
+
+    Returns:
+        Scalar, and the loss of each eye.
+    """
+    parts = {}
+    for name, view in network.views(geometry.flange_motion(q.double())).items():
+        facing = view.rotation.transpose(1, 2) @ truth.goal_normal.double()[:, :, None]
+        loss, _ = sighting_loss(sightings[name], truth.targets[name], facing[:, :2, 0].float())
+        parts[f"{name}_loss"] = loss
+    return torch.stack(list(parts.values())).sum(), parts
+
+
+def remembered(network: BeliefNetwork, window: Window) -> Tensor:
+    """The memory at each step, its observation in it, (B, T, k) float64."""
+    n, length = window.counts.shape
+    q = window.state[..., :N_JOINTS]
+    motion = geometry.flange_motion(q.reshape(-1, N_JOINTS).double())
+    views = {
+        name: View(
+            view.origin.reshape(n, length, 3), view.rotation.reshape(n, length, 3, 3), view.tan
+        )
+        for name, view in network.views(motion).items()
+    }
+    memory, memories = window.memory, []
+    for t in range(length):
+        memory = memory.clone()
+        memory[:, SET_POINT], memory[:, BEGUN] = window.truth.set_point[:, t].double(), 1.0
+        memory = network.remember(
+            memory,
+            {name: sighting[:, t] for name, sighting in window.sightings.items()},
+            q[:, t],
+            {name: View(v.origin[:, t], v.rotation[:, t], v.tan) for name, v in views.items()},
+        )
+        memories.append(memory)
+    return torch.stack(memories, dim=1)
+
+
+def window_lesson(network: BeliefNetwork, window: Window) -> tuple[Tensor, Parts]:
+    """Loss of belief and head over windows.
+
+    Args:
+        network: What learns; no gradient reaches its eyes.
+        window: What it learns from.
+
+    Returns:
+        Scalar, and its parts.
+    """
+    counts = window.counts
+    memory, state = remembered(network, window)[counts], window.state[counts]
+    truth = window.truth.at(counts)
+    normal = truth.goal_normal.double()
+    believed, of_belief = belief_loss(
+        memory[:, :BELIEF_SIZE],
+        truth.goal_position.double() - network.belief.standoff * normal,
+        truth.goal_velocity.double(),
+        normal[:, :2] / normal[:, 2:],
+        network.shape.error_scale,
+    )
+    out = network.decide(
+        memory,
+        {name: sighting[counts] for name, sighting in window.sightings.items()},
+        state,
+        None if window.felt is None else window.felt[counts],
+    )
+    label = network.encode_label(window.action[counts], memory)
+    action = action_loss(out, label)
+    astray = tip_loss(network, out, label, state, truth.goal_position)
+    parts = {"action_loss": action, "tip_loss": astray}
+    parts |= {f"belief_{name}_loss": part.float() for name, part in of_belief.items()}
+    return action + TIP_WEIGHT * astray + believed.float(), parts

@@ -1,0 +1,342 @@
+"""The visuomotor network: eyes, a belief, and a head that turns it into a joint step.
+
+What it knows beforehand is the cell: the arm's kinematics and the cameras' nominal places. What a
+task is (where targets lie, how large they are, how far off the tool stays, what comes first) it
+learns from demonstrations.
+
+The head thinks in the goal's frame first: a small network says to which point by the goal the tip
+should go next, damped least squares turn that into a joint step, the ways to two plain postures
+over the goal are put beside it, and a second network mixes them and corrects the sum, on a
+logarithmic scale on which a micrometre and a metre both teach something.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+
+import torch
+import torch.nn.functional as F  # noqa: N812
+from torch import Tensor, nn
+
+from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
+from hvs_suite.policies.belief import arm
+from hvs_suite.policies.belief.belief import (
+    ACCELERATION,
+    BELIEF_SIZE,
+    COVARIANCE,
+    N_MOTION,
+    PLACE,
+    TILT_VARIANCE,
+    VELOCITY,
+    Belief,
+    View,
+)
+from hvs_suite.policies.belief.eye import LOG_DIAMETER, UV, VISIBLE, Eye
+from hvs_suite.policies.network import geometry
+from hvs_suite.policies.network.geometry import FlangeMotion
+
+N_JOINTS = 7
+HEIGHTS_M = (0.0, 0.05, 0.15)
+"""Above the goal, along its normal: the plain postures that the head is shown."""
+RECENT_SIZE = 4
+"""What is remembered beside belief and set point: for how long each camera has not seen the target
+(two), and a trace of what was forgotten (two)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CellModel:
+    """The cell as it is drawn up, known to any policy.
+
+    Attributes:
+        period_s: Control period (s).
+        tool_length_m: From the flange to the tip (m).
+        tan: Camera name to the tangent of half its field of view.
+        eth_origin: Nominal place of the eye to hand, (3,) m.
+        eth_rotation: Its optical axes as columns, (3, 3).
+        eih_origin: Place of the eye in the hand in the flange frame, (3,) m.
+        eih_rotation: Its optical axes there as columns, (3, 3).
+    """
+
+    period_s: float
+    tool_length_m: float
+    tan: Mapping[str, float]
+    eth_origin: tuple[float, ...]
+    eth_rotation: tuple[tuple[float, ...], ...]
+    eih_origin: tuple[float, ...]
+    eih_rotation: tuple[tuple[float, ...], ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Shape:
+    """Sizes that decide which weights there are.
+
+    Attributes:
+        cameras: Name (``eih``, ``eth``) to (channels, side in px).
+        n_goals: Length of the one-hot that says which target is meant; 0 for none.
+        n_felt: Length of the wrench; 0 for none.
+        channels: Channels of the eyes.
+        hidden: Width of the head.
+        error_scale: Below it errors weigh linearly, above logarithmically: joint steps (rad) and
+            places (m).
+    """
+
+    cameras: Mapping[str, tuple[int, int]]
+    n_goals: int = 0
+    n_felt: int = 0
+    channels: int = 32
+    hidden: int = 256
+    error_scale: float = 0.005
+
+
+MEMORY_SIZE = BELIEF_SIZE + N_JOINTS + 1 + RECENT_SIZE
+SET_POINT = slice(BELIEF_SIZE, BELIEF_SIZE + N_JOINTS)
+BEGUN = slice(BELIEF_SIZE + N_JOINTS, BELIEF_SIZE + N_JOINTS + 1)
+RECENT = slice(BELIEF_SIZE + N_JOINTS + 1, MEMORY_SIZE)
+
+
+class BeliefNetwork(nn.Module):
+    """Eyes, belief and head.
+
+    Args:
+        shape: Sizes.
+        cell: What is known of the cell.
+    """
+
+    joint_range: Tensor
+    joint_speed: Tensor
+
+    def __init__(self, shape: Shape, cell: CellModel) -> None:
+        super().__init__()
+        self.shape, self.cell = shape, cell
+        cameras = tuple(shape.cameras)
+        self.eyes = nn.ModuleDict(
+            {
+                n: Eye(c, side, shape.channels, shape.n_goals)
+                for n, (c, side) in shape.cameras.items()
+            }
+        )
+        self.belief = Belief(cameras, cell.period_s)
+        self.register_buffer(
+            "joint_range", torch.tensor(JOINT_RANGE_RAD, dtype=torch.float32), persistent=False
+        )
+        self.register_buffer(
+            "joint_speed", torch.tensor(JOINT_SPEED_RAD_S, dtype=torch.float32), persistent=False
+        )
+        n = len(cameras)
+        hidden = shape.hidden
+        width = 3 * N_JOINTS + N_JOINTS + N_JOINTS  # q, velocity, pending
+        width += 4 * n + RECENT_SIZE  # sightings
+        width += N_MOTION + 1 + 3 + 3 + 2  # deviations; velocity, acceleration, slope
+        width += 2 * 8  # arm and set point in the goal's frame
+        width += shape.n_felt * 2
+        self.width = width
+        n_ways = len(HEIGHTS_M)
+        way_width = n_ways * (2 * (N_JOINTS - 1) + 2)
+        # To which point by the goal: sideways (two) and along the normal, and how far ahead.
+        guide_last = nn.Linear(128, 4)
+        nn.init.zeros_(guide_last.weight)
+        nn.init.zeros_(guide_last.bias)
+        self.guide = nn.Sequential(
+            nn.Linear(width, 128), nn.SiLU(), nn.Linear(128, 128), nn.SiLU(), guide_last
+        )
+        self.lead_s = nn.Parameter(torch.tensor(0.1))
+        full = width + way_width + N_JOINTS * (1 + n_ways)
+        last = nn.Linear(hidden, N_JOINTS + 1 + n_ways)
+        with torch.no_grad():
+            last.weight.mul_(0.1)
+            last.bias.zero_()
+        self.head = nn.Sequential(
+            nn.Linear(full, hidden),
+            nn.SiLU(),
+            nn.Linear(hidden, hidden),
+            nn.SiLU(),
+            nn.Linear(hidden, hidden),
+            nn.SiLU(),
+            last,
+        )
+        gains = torch.zeros(1 + n_ways, N_JOINTS)
+        gains[0], gains[1] = 0.5, 0.5
+        self.gains = nn.Parameter(gains)
+
+    # --- the cell ---
+
+    def views(self, motion: FlangeMotion) -> dict[str, View]:
+        """Where the cameras are, by the measured joints, float64."""
+        cell, n = self.cell, len(motion.position)
+        R, p = motion.rotation.double(), motion.position.double()
+        views = {}
+        for name in self.shape.cameras:
+            if name == "eih":
+                axes = torch.tensor(cell.eih_rotation, dtype=torch.float64)
+                at = torch.tensor(cell.eih_origin, dtype=torch.float64)
+                views[name] = View(p + R @ at, R @ axes, cell.tan[name])
+            else:
+                axes = torch.tensor(cell.eth_rotation, dtype=torch.float64)
+                at = torch.tensor(cell.eth_origin, dtype=torch.float64)
+                views[name] = View(at.expand(n, 3), axes.expand(n, 3, 3), cell.tan[name])
+        return views
+
+    def look(self, images: Mapping[str, Tensor], goal: Tensor | None = None) -> dict[str, Tensor]:
+        """Run the eyes: camera name to sightings (B, 9)."""
+        return {name: eye(images[name], goal) for name, eye in self.eyes.items()}
+
+    # --- one step ---
+
+    def start(self, n: int) -> Tensor:
+        """The memory at the beginning of an episode, (n, k) float64."""
+        memory = torch.zeros(n, MEMORY_SIZE, dtype=torch.float64)
+        memory[:, :BELIEF_SIZE] = self.belief.start(n)
+        memory[:, RECENT] = 1.0
+        return memory
+
+    def remember(
+        self,
+        memory: Tensor,
+        sightings: Mapping[str, Tensor],
+        q: Tensor,
+        views: Mapping[str, View] | None = None,
+    ) -> Tensor:
+        """Take an observation into the memory.
+
+        Args:
+            memory: (B, k), before it.
+            sightings: Camera name to (B, 9).
+            q: Measured joint positions, (B, 7) rad.
+            views: As `views` returns them for these; None computes them.
+
+        Returns:
+            (B, k).
+        """
+        if views is None:
+            views = self.views(geometry.flange_motion(q.double()))
+        believed, forget = self.belief(memory[:, :BELIEF_SIZE], sightings, views)
+        set_point = torch.where(memory[:, BEGUN] > 0, memory[:, SET_POINT], q.double())
+        recent = memory[:, RECENT]
+        logits = torch.cat(
+            [s[:, VISIBLE] for s in sightings.values()]
+            + [sightings[next(iter(sightings))][:, VISIBLE]] * (2 - len(sightings)),
+            dim=1,
+        ).double()
+        seen = torch.sigmoid(logits)
+        # Not seen since it was last forgotten: 1; falls to 0 when it is seen.
+        unseen = torch.maximum(recent[:, :2], forget) * (1.0 - seen)
+        away = (1.0 - seen) * (recent[:, 2:] * 0.9 + 0.1)
+        return torch.cat(
+            [believed, set_point, torch.ones_like(set_point[:, :1]), unseen, away], dim=1
+        )
+
+    def commanded(self, memory: Tensor, action: Tensor) -> Tensor:
+        """Remember an action (B, 7) in [-1, 1] too: the set point moves towards it."""
+        set_point = memory[:, SET_POINT]
+        longest = (self.joint_speed * self.cell.period_s).double()
+        way = (action * self.joint_range).double() - set_point
+        memory = memory.clone()
+        memory[:, SET_POINT] = set_point + torch.maximum(torch.minimum(way, longest), -longest)
+        return memory
+
+    def decide(
+        self,
+        memory: Tensor,
+        sightings: Mapping[str, Tensor],
+        state: Tensor,
+        felt: Tensor | None = None,
+    ) -> Tensor:
+        """What to do: a joint step from the set point, as the head says it, (B, 7).
+
+        Args:
+            memory: (B, k), with this observation in it.
+            sightings: Camera name to (B, 9).
+            state: (B, 14).
+            felt: Wrench at the tip, (B, 6); None without.
+        """
+        scale = self.shape.error_scale
+        q, velocity = state[:, :N_JOINTS], state[:, N_JOINTS:]
+        set_point = memory[:, SET_POINT].float()
+        pending = set_point - q
+        here = arm.tip_of(geometry.flange_motion(q), self.cell.tool_length_m)
+        sent = arm.tip_of(geometry.flange_motion(set_point), self.cell.tool_length_m)
+        believed = memory[:, :BELIEF_SIZE]
+        normal = self.belief.normal(believed).float()
+        standoff = self.belief.standoff.float()
+        place, speed = believed[:, PLACE].float(), believed[:, VELOCITY].float()
+        goal = place + standoff * normal
+        bend = believed[:, ACCELERATION].float()
+        P = believed[:, COVARIANCE].view(-1, N_MOTION, N_MOTION)
+        stds = torch.diagonal(P, dim1=1, dim2=2).clamp(min=1e-14).sqrt().float()
+        tilt_std = believed[:, TILT_VARIANCE].sqrt().float()
+        features = [torch.sin(q), torch.cos(q), q / self.joint_range, velocity / self.joint_speed]
+        features.append(torch.asinh(pending / scale))
+        for s in sightings.values():
+            features += [torch.tanh(s[:, VISIBLE] / 4.0), s[:, UV].clamp(-2, 2)]
+            features.append(0.3 * s[:, LOG_DIAMETER])
+        features.append(memory[:, RECENT].float())
+        features += [0.3 * torch.log(stds), 0.3 * torch.log(tilt_std), 10.0 * speed, 5.0 * bend]
+        features.append(normal[:, :2])
+        for tip in (here, sent):
+            features.append(self._in_goal_frame(tip, goal, normal))
+        if felt is not None:
+            features += [felt / 20.0, torch.asinh(felt / 0.5)]
+        inputs = torch.cat(features, dim=1)
+        # The point by the goal, its sideways axes those of the tool.
+        guided = self.guide(inputs)
+        bound = math.asinh(0.3 / scale)
+        by = scale * torch.sinh(guided[:, :3].clamp(-bound, bound))
+        side = sent.rotation[:, :, :2]
+        side = side - normal[:, :, None] * (normal[:, None] @ side)
+        lead = self.lead_s * (1.0 + 0.5 * torch.tanh(guided[:, 3:]))
+        ahead = goal + lead * speed + 0.5 * lead**2 * bend
+        waypoint = ahead + (side @ by[:, :2, None])[:, :, 0] + by[:, 2:] * normal
+        proposals = [arm.joint_step(sent, waypoint - sent.position, normal)]
+        ways = []
+        tool = self.cell.tool_length_m
+        for height in HEIGHTS_M:
+            over = (ahead + (height + tool) * normal).detach()
+            turns, time_s, within = arm.way_to_posture(set_point, over, normal.detach())
+            step = turns * (self.cell.period_s / time_s.clamp(min=self.cell.period_s))
+            proposals.append(F.pad(step, (0, 1)))
+            ways += [torch.asinh(turns / scale), time_s, within]
+            ways.append(torch.asinh(step / scale))
+        said = [torch.asinh(p / scale) for p in proposals]
+        out = self.head(torch.cat([inputs, *ways, *said], dim=1))
+        mix = out[:, N_JOINTS:]
+        total = out[:, :N_JOINTS]
+        for k, each in enumerate(said):
+            total = total + (self.gains[k] + mix[:, k : k + 1]) * each
+        return total
+
+    def _in_goal_frame(self, tip: FlangeMotion, goal: Tensor, normal: Tensor) -> Tensor:
+        """Where a tip is by the goal, along tool and normal, and how tilted it is, (B, 8)."""
+        scale = self.shape.error_scale
+        offset = tip.position - goal
+        height = (offset * normal).sum(dim=1, keepdim=True)
+        side = (offset[:, None] @ tip.rotation[:, :, :2])[:, 0]
+        lateral = (offset - height * normal).norm(dim=1, keepdim=True)
+        tilt = (normal[:, None] @ tip.rotation[:, :, :2])[:, 0]
+        return torch.cat(
+            [
+                torch.asinh(side / scale),
+                torch.asinh(height / scale),
+                torch.asinh(lateral / scale),
+                2.0 * height,
+                2.0 * lateral,
+                torch.asinh(tilt / scale),
+            ],
+            dim=1,
+        )
+
+    # --- out ---
+
+    def to_step(self, out: Tensor) -> Tensor:
+        """Joint step that the head's output stands for, both (B, 7), rad."""
+        bound = math.asinh(1.0 / self.shape.error_scale)
+        return self.shape.error_scale * torch.sinh(out.clamp(-bound, bound))
+
+    def to_action(self, out: Tensor, memory: Tensor) -> Tensor:
+        """Joint position targets in units of the joint range, (B, 7) in [-1, 1]."""
+        target = memory[:, SET_POINT].float() + self.to_step(out)
+        return (target / self.joint_range).clamp(-1.0, 1.0)
+
+    def encode_label(self, action: Tensor, memory: Tensor) -> Tensor:
+        """Inverse of `to_action` without the clipping: what the head should have said, (B, 7)."""
+        step = action * self.joint_range - memory[:, SET_POINT].float()
+        return torch.asinh(step / self.shape.error_scale)

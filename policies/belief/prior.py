@@ -1,0 +1,112 @@
+"""The prior of a belief, from demonstrations: where goals are, and how they move and look."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from hvs_suite.policies.belief.belief import ACCELERATION, N_MOTION, PLACE, VELOCITY, Prior, View
+from hvs_suite.policies.network.dataset import (
+    EPISODE,
+    GOAL_NORMAL,
+    GOAL_POSITION,
+    GOAL_VELOCITY,
+    TARGET_PREFIX,
+)
+
+WIDER = 1.5
+"""Variances are so much larger than those of the demonstrations: scenes to come may lie beyond."""
+PLACE_FLOOR_M = 2e-5
+MOTION_FLOOR = 1e-5
+"""Of velocities (m/s) and accelerations (m/s2)."""
+SLOPE_VARIANCE_FLOOR = 1e-7
+"""Where all demonstrations are alike, the prior is not quite certain."""
+UNSEEN_SIZE = 0.02
+"""Size of a target that a camera never saw (image widths times m)."""
+
+
+def fit_prior(
+    columns: Mapping[str, npt.NDArray[np.generic]], views: Mapping[str, View], period_s: float
+) -> Prior:
+    """Fit the prior to recorded frames.
+
+    Goals g_i with unit normals n_i are known, and that the target lies on the ray d_i from a
+    camera's centre o_i through its picture. It lies at g_i - s n_i, and the standoff s is the one
+    that leaves the least angles to these rays: with A_i = I - d_i d_i' and w_i = 1 / |g_i - o_i|^2,
+
+        s = sum(w_i n_i' A_i (g_i - o_i)) / sum(w_i n_i' A_i n_i).
+
+    The eye in hand tells it, whose place is known where it stands; without one, the eye to hand.
+    Looks along the normal do not count, because A_i n_i is 0 there; if there are no others, s is 0.
+    Mean and covariance are those of g_i - s n_i, of the velocities, of their differences from frame
+    to frame and of the slopes n_xy / n_z, the covariance `WIDER`; a camera's size is the median of
+    apparent diameter times depth.
+
+    Args:
+        columns: ``privileged.goal_position`` and ``privileged.goal_normal`` (n, 3),
+            ``privileged.target_<camera>`` (n, 4) of each camera of the views,
+            ``episode_index`` (n,), and ``privileged.goal_velocity`` (n, 3), without which goals
+            stand still.
+        views: Camera name to its pose at each frame, nominal.
+        period_s: Control period (s).
+
+    Returns:
+        The prior.
+    """
+    goal, normal = _double(columns[GOAL_POSITION]), _double(columns[GOAL_NORMAL])
+    velocity = (
+        _double(columns[GOAL_VELOCITY]) if GOAL_VELOCITY in columns else torch.zeros_like(goal)
+    )
+    targets = {name: _double(columns[TARGET_PREFIX + name]) for name in views}
+    teller = "eih" if "eih" in views else next(iter(views))
+    standoff = _standoff(goal, normal, targets[teller], views[teller])
+    place = goal - standoff * normal
+    covariance = torch.zeros(N_MOTION, N_MOTION, dtype=torch.float64)
+    off = place - place.mean(dim=0)
+    covariance[PLACE, PLACE] = WIDER * off.T @ off / len(off)
+    # About zero, where the belief begins.
+    covariance[VELOCITY, VELOCITY] = WIDER * velocity.T @ velocity / len(velocity)
+    episode = torch.from_numpy(np.asarray(columns[EPISODE], np.int64))
+    change = velocity.diff(dim=0)[episode.diff() == 0] / period_s
+    covariance[ACCELERATION, ACCELERATION] = WIDER * change.T @ change / max(1, len(change))
+    floors = torch.tensor([PLACE_FLOOR_M] * 3 + [MOTION_FLOOR] * 6, dtype=torch.float64)
+    slope = normal[:, :2] / normal[:, 2:]
+    spread = (slope - slope.mean(dim=0)).square().mean()
+    return Prior(
+        place=place.mean(dim=0),
+        covariance=covariance + torch.diag(floors.square()),
+        slope=slope.mean(dim=0),
+        slope_variance=float(WIDER * spread + SLOPE_VARIANCE_FLOOR),
+        standoff_m=standoff,
+        sizes={name: _size(place, targets[name], view) for name, view in views.items()},
+    )
+
+
+def _standoff(goal: Tensor, normal: Tensor, target: Tensor, view: View) -> float:
+    seen = _in_view(target)
+    uv = target[seen, :2] * view.tan
+    ray = torch.cat([uv, torch.ones_like(uv[:, :1])], dim=1)
+    direction = (view.rotation[seen] @ (ray / ray.norm(dim=1, keepdim=True))[:, :, None])[:, :, 0]
+    n, offset = normal[seen], goal[seen] - view.origin[seen]
+    across = n - (n * direction).sum(dim=1, keepdim=True) * direction  # A n
+    weight = 1.0 / offset.square().sum(dim=1)
+    told = float((weight * (across * n).sum(dim=1)).sum())
+    return float((weight * (across * offset).sum(dim=1)).sum()) / told if told > 0.0 else 0.0
+
+
+def _size(place: Tensor, target: Tensor, view: View) -> float:
+    seen = _in_view(target)
+    if not seen.any():
+        return UNSEEN_SIZE
+    depth = (view.rotation.transpose(1, 2) @ (place - view.origin)[:, :, None])[:, 2, 0]
+    return float((target[:, 2] * depth)[seen].median())
+
+
+def _in_view(target: Tensor) -> Tensor:
+    return (target[:, 3] > 0.5) & (target[:, :2].abs().amax(dim=1) < 1.0)
+
+
+def _double(column: npt.NDArray[np.generic]) -> Tensor:
+    return torch.from_numpy(np.asarray(column, np.float64))

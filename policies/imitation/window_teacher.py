@@ -1,0 +1,184 @@
+"""Teaches a network with a belief: its eyes from frames, the rest from windows of control steps.
+
+The training falls into parts, one more than there are DAgger rounds. In each of them the eyes learn
+first, as far as `EYE_SHARE` of it, from frames; then they look at all frames, and belief and head
+learn from windows of what they saw. So the belief learns of the errors that these very eyes make,
+and what plays the next round has eyes and a belief that know each other.
+"""
+
+import bisect
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from hvs_suite.errors import DatasetError
+from hvs_suite.policies.belief.lessons import eye_lesson, window_lesson
+from hvs_suite.policies.belief.network import N_JOINTS
+from hvs_suite.policies.belief.prior import fit_prior
+from hvs_suite.policies.belief.recorded import recorded, recorded_keys
+from hvs_suite.policies.imitation.dagger import round_shares
+from hvs_suite.policies.imitation.demonstrations import Demonstrations
+from hvs_suite.policies.imitation.settings import Settings
+from hvs_suite.policies.imitation.teacher import HELD_OUT_BATCH, HELD_OUT_FRAMES, Parts
+from hvs_suite.policies.imitation.windows import Rows, WindowPool
+from hvs_suite.policies.network.dataset import EPISODE
+from hvs_suite.policies.network.geometry import flange_motion
+from hvs_suite.policies.network.network import STATE
+
+if TYPE_CHECKING:
+    from hvs_suite.policies.hvs_belief.modeling_hvs_belief import HvsBeliefPolicy
+
+EYE_SHARE = 0.5
+"""Of each part of the training: the eyes' own."""
+RECALL_SHARE = 0.05
+"""How often the belief goes through all episodes again."""
+WINDOW_STREAM = 6
+# Philox words that keep this stream apart from others of the same seed.
+SEEN = "seen.safetensors"
+
+
+class WindowTeacher:
+    """Teaches `HvsBeliefPolicy`.
+
+    Args:
+        policy: What learns.
+        demonstrations: What it learns from.
+        settings: Of the run.
+        folder: Keeps what the eyes saw.
+    """
+
+    def __init__(
+        self,
+        policy: "HvsBeliefPolicy",
+        demonstrations: Demonstrations,
+        settings: Settings,
+        folder: Path,
+    ) -> None:
+        self.policy = policy
+        self.demonstrations = demonstrations
+        self._settings = settings
+        self._file = folder / SEEN
+        config = policy.config
+        self._windows = WindowPool(demonstrations, config.goal_key, config.wrench_key)
+        self._bounds = [0.0, *round_shares(settings.dagger_rounds), 1.0]
+        self._looked_in = -1
+        """Part of the training in which the eyes looked at all frames last."""
+        self._due = 0.0
+        self._opened = False
+        self._eyes_learn = True
+
+    def clipped_apart(self) -> list[list[nn.Parameter]]:
+        """The eyes, and the rest: they learn in turns."""
+        eyes = list(self.policy.network.eyes.parameters())
+        known = {id(parameter) for parameter in eyes}
+        return [eyes, [p for p in self.policy.parameters() if id(p) not in known]]
+
+    def is_due(self, share: float) -> bool:
+        """Whether eyes or belief are to go through everything again."""
+        if not self._opened:
+            self._reopen(share)
+        part, self._eyes_learn = self._part(share)
+        return not self._eyes_learn and (part > self._looked_in or share >= self._due)
+
+    def _part(self, share: float) -> tuple[int, bool]:
+        """Which part of the training this is, and whether it is the eyes' turn."""
+        part = min(bisect.bisect_right(self._bounds, share) - 1, len(self._bounds) - 2)
+        begin, end = self._bounds[part : part + 2]
+        return part, share < begin + EYE_SHARE * (end - begin)
+
+    def _reopen(self, share: float) -> None:
+        """Go on with what a killed run saw last, if it has gone so far."""
+        self._opened = True
+        kept = self._windows.reopen(self._file, self.policy.network) if share > 0.0 else None
+        if kept is not None:
+            self._looked_in, self._due = self._part(kept)[0], _next_due(kept)
+
+    def look_again(self, share: float) -> None:
+        """Look at all frames once in each part of the training; recall all episodes."""
+        network, (part, _) = self.policy.network, self._part(share)
+        self.policy.eval()
+        if part > self._looked_in:
+            self._windows.look(network)
+        else:
+            self._windows.recall(network)
+        self.policy.train()
+        self._windows.keep(self._file, share)
+        self._looked_in, self._due = part, _next_due(share)
+
+    def lesson(self, rows: Rows, step: int) -> tuple[Tensor, Parts]:
+        """As `Teacher.lesson`."""
+        if self._eyes_learn:
+            loss, parts = self._eye_lesson(rows)
+        else:
+            key = np.random.Philox(key=[self._settings.seed, WINDOW_STREAM], counter=step)
+            window = self._windows.draw(
+                self.policy.network,
+                self.demonstrations.episodes_to_learn_from,
+                self._settings.windows,
+                self._settings.window_steps,
+                np.random.Generator(key),
+            )
+            loss, parts = window_lesson(self.policy.network, window)
+        return loss, {name: part.item() for name, part in parts.items()}
+
+    def _eye_lesson(self, rows: Rows) -> tuple[Tensor, dict[str, Tensor]]:
+        network = self.policy.network
+        batch = self.demonstrations.batch(rows)
+        columns = {key: value.numpy() for key, value in batch.items() if "images" not in key}
+        # Frames of a batch are no episodes: where the arm was sent is not asked here.
+        columns[EPISODE] = np.arange(len(rows))
+        truth = recorded(columns, tuple(network.shape.cameras), network.cell.period_s)
+        sightings = network.look(*self._windows.pictures(network, batch))
+        return eye_lesson(network, sightings, batch[STATE][:, :N_JOINTS], truth)
+
+    def held_out(self) -> Parts:
+        """As `Teacher.held_out`; of the eyes alone, whose frames are seen for the first time."""
+        indices = self.demonstrations.held_out
+        if not len(indices):
+            return {}
+        spread = np.linspace(0, len(indices) - 1, min(len(indices), HELD_OUT_FRAMES))
+        indices = indices[spread.astype(np.int64)]
+        sums: Parts = {}
+        self.policy.eval()
+        with torch.no_grad():
+            for first in range(0, len(indices), HELD_OUT_BATCH):
+                some = indices[first : first + HELD_OUT_BATCH]
+                loss, parts = self._eye_lesson(some)
+                for name, value in {"loss": loss, **parts}.items():
+                    sums[name] = sums.get(name, 0.0) + value.item() * len(some)
+        self.policy.train()
+        return {name: value / len(indices) for name, value in sums.items()}
+
+    def save(self, out: Path) -> None:
+        """As `Teacher.save`."""
+        from hvs_suite.policies.hvs_belief.modeling_hvs_belief import save_checkpoint
+
+        save_checkpoint(self.policy, out)
+
+
+def set_prior(policy: "HvsBeliefPolicy", demonstrations: Demonstrations) -> None:
+    """Give a fresh policy the prior of what it is to learn from.
+
+    Args:
+        policy: Gets it.
+        demonstrations: What it is to learn from.
+
+    Raises:
+        DatasetError: Columns are missing that say what is true.
+    """
+    network = policy.network
+    columns = demonstrations.columns()
+    if missing := sorted({*recorded_keys(tuple(network.shape.cameras))} - {*columns}):
+        raise DatasetError(
+            f"{demonstrations.manifest.root} lacks {', '.join(missing)}, from which hvs_belief "
+            "learns; record it with hvs record"
+        )
+    views = network.views(flange_motion(torch.from_numpy(columns[STATE][:, :N_JOINTS]).double()))
+    network.belief.set_prior(fit_prior(columns, views, network.cell.period_s))
+
+
+def _next_due(share: float) -> float:
+    return RECALL_SHARE * (int(share / RECALL_SHARE + 1e-9) + 1)

@@ -1,0 +1,40 @@
+"""Writes a LeRobot policy so that what stood there before stays whole until it is replaced."""
+
+import json
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from hvs_suite.errors import OutputError, first_line
+
+
+def write_checkpoint(policy: Any, processors: Iterable[Any], folder: Path) -> None:
+    """Write a checkpoint that LeRobot and the suite load, each file whole or not at all.
+
+    Args:
+        policy: A LeRobot policy.
+        processors: Its pre- and post-processor.
+        folder: Gets ``config.json``, ``model.safetensors`` and the two processors.
+
+    Raises:
+        OutputError: It cannot be written; what stood there before still does.
+    """
+    from safetensors import SafetensorError
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".checkpoint-") as name:
+            scratch = Path(name)
+            policy.save_pretrained(scratch)
+            for processor in processors:
+                processor.save_pretrained(scratch)
+            # LeRobot reads the type before it knows the class; keep the file stable for diffs.
+            config = json.loads((scratch / "config.json").read_text())
+            (scratch / "config.json").write_text(
+                json.dumps(config, indent=2, sort_keys=True) + "\n"
+            )
+            for path in sorted(scratch.iterdir()):
+                path.replace(folder / path.name)
+    except (OSError, SafetensorError) as error:
+        raise OutputError(f"cannot write {folder}: {first_line(error)}") from error
