@@ -15,7 +15,7 @@ from hvs_suite.cell.robot import (
     SHOULDER_TO_ELBOW_M,
     WRIST_TO_FLANGE_M,
 )
-from hvs_suite.policies.network.geometry import FlangeMotion
+from hvs_suite.policies.network.geometry import FlangeMotion, flange_motion
 
 DAMPING_M = 0.03
 """Of the least-squares inverse: small against the arm's 0.4 m links, large enough to keep steps
@@ -25,6 +25,12 @@ LINEAR_RANGE_RAD = 0.30
 """Errors are shortened to this before the inverse, which only holds near by."""
 LEVER_M = 0.2
 """Angles weigh like the offsets that they cause so far away."""
+BEYOND_M = 0.01
+"""How far beyond its goal the tip may be sent (m): more than any demonstrator overshoots."""
+BESIDE_M = 0.1
+DOUBTS = 2.0
+LIFTS = 3
+LIFT_DAMPING_M = 0.05
 UNREACHABLE_S = 100.0
 """Added to the time of a way that leads out of the joint ranges."""
 
@@ -146,3 +152,36 @@ def way_to_posture(q: Tensor, flange: Tensor, normal: Tensor) -> tuple[Tensor, T
     nearer = torch.where(within, times, times + UNREACHABLE_S).argmin(dim=1)
     row = torch.arange(len(q), device=q.device)
     return ways[row, nearer], times[row, nearer, None], within[row, nearer, None].to(q)
+
+
+def kept_above(
+    q: Tensor, goal: Tensor, normal: Tensor, doubt_m: Tensor, tool_length_m: float
+) -> Tensor:
+    """The joint angles nearest to given ones at which the tip is not beyond its goal.
+
+    What comes down fast, one joint against another, is easily some centimetres too low, and touches
+    what the goal is above. So near the goal the tip stays on its side: its height along the normal
+    is at least `DOUBTS` times how well the goal's is known, less `BEYOND_M`; farther than
+    `BESIDE_M` beside it, as much less as it is farther. Gauss-Newton on that height, damped as
+    `joint_step` is; angles that are high enough are left alone.
+
+    Args:
+        q: Joint angles, (B, 7) rad.
+        goal: Of the tip, (B, 3) m.
+        normal: Unit normal there, (B, 3).
+        doubt_m: Standard deviation of the goal along it, (B, 1) m.
+        tool_length_m: From the flange to the tip (m).
+
+    Returns:
+        Joint angles, (B, 7) rad.
+    """
+    for _ in range(LIFTS):
+        tip = tip_of(flange_motion(q), tool_length_m)
+        offset = tip.position - goal
+        height = (offset * normal).sum(dim=1, keepdim=True)
+        lateral = (offset - height * normal).norm(dim=1, keepdim=True)
+        least = DOUBTS * doubt_m - BEYOND_M - (lateral - BESIDE_M).clamp(min=0.0)
+        rise = (normal[:, None] @ tip.jacobian[:, :3])[:, 0]
+        gain = rise.square().sum(dim=1, keepdim=True) + LIFT_DAMPING_M**2
+        q = q + rise * ((least - height).clamp(min=0.0) / gain)
+    return q

@@ -256,10 +256,8 @@ class BeliefNetwork(nn.Module):
         here = arm.tip_of(geometry.flange_motion(q), self.cell.tool_length_m)
         sent = arm.tip_of(geometry.flange_motion(set_point), self.cell.tool_length_m)
         believed = memory[:, :BELIEF_SIZE]
-        normal = self.belief.normal(believed).float()
-        standoff = self.belief.standoff.float()
-        place, speed = believed[:, PLACE].float(), believed[:, VELOCITY].float()
-        goal = place + standoff * normal
+        goal, normal = self._goal(memory)
+        speed = believed[:, VELOCITY].float()
         bend = believed[:, ACCELERATION].float()
         P = believed[:, COVARIANCE].view(-1, N_MOTION, N_MOTION)
         stds = torch.diagonal(P, dim1=1, dim2=2).clamp(min=1e-14).sqrt().float()
@@ -332,9 +330,29 @@ class BeliefNetwork(nn.Module):
         return self.shape.error_scale * torch.sinh(out.clamp(-bound, bound))
 
     def to_action(self, out: Tensor, memory: Tensor) -> Tensor:
-        """Joint position targets in units of the joint range, (B, 7) in [-1, 1]."""
+        """Decode the head's output, and keep the tip from going beyond the goal.
+
+        Args:
+            out: (B, 7).
+            memory: With this observation in it, (B, k).
+
+        Returns:
+            Joint position targets in units of the joint range, (B, 7) in [-1, 1].
+        """
         target = memory[:, SET_POINT].float() + self.to_step(out)
+        goal, normal = self._goal(memory)
+        P = memory[:, COVARIANCE].view(-1, N_MOTION, N_MOTION)[:, PLACE, PLACE].float()
+        doubt = (normal * (P @ normal[:, :, None])[:, :, 0]).sum(dim=1, keepdim=True)
+        doubt = doubt.clamp(min=0.0).sqrt()
+        target = arm.kept_above(target, goal, normal, doubt, self.cell.tool_length_m)
         return (target / self.joint_range).clamp(-1.0, 1.0)
+
+    def _goal(self, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Where the tip is taken to have to go (B, 3) m, and the normal there (B, 3)."""
+        believed = memory[:, :BELIEF_SIZE]
+        normal = self.belief.normal(believed)
+        goal = believed[:, PLACE] + self.belief.standoff * normal
+        return goal.float(), normal.float()
 
     def encode_label(self, action: Tensor, memory: Tensor) -> Tensor:
         """Inverse of `to_action` without the clipping: what the head should have said, (B, 7)."""

@@ -1,0 +1,68 @@
+"""Geometry of the second policy: postures, steps and how far down the tip may go."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from hvs_suite.policies.belief import arm
+from hvs_suite.policies.network.geometry import flange_motion
+
+UP = torch.tensor([[0.0, 0.0, 1.0]])
+
+
+def goals(n: int, *, tilt: float) -> tuple[Tensor, Tensor]:
+    """Places all around the base, and unit normals about as tilted as given (rad)."""
+    generator = torch.Generator().manual_seed(0)
+    around = 2.0 * math.pi * torch.rand(n, generator=generator)
+    out = 0.42 + 0.25 * torch.rand(n, generator=generator)
+    place = torch.stack([out * around.cos(), out * around.sin(), torch.full((n,), 0.1)], dim=1)
+    slope = tilt * torch.randn(n, 2, generator=generator)
+    normal = torch.cat([slope, torch.ones(n, 1)], dim=1)
+    return place, normal / normal.norm(dim=1, keepdim=True)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.3])
+def test_both_postures_hold_the_flange_at_the_place_and_face_the_normal(tilt: float) -> None:
+    place, normal = goals(100, tilt=tilt)
+    for q in arm.postures(place, normal).unbind(dim=1):
+        motion = flange_motion(torch.nn.functional.pad(q, (0, 1)))
+        np.testing.assert_allclose(motion.position, place, atol=1e-5)
+        np.testing.assert_allclose(motion.rotation[:, :, 2], -normal, atol=1e-5)
+
+
+@pytest.mark.parametrize("tool_m", [0.0, 0.07])
+def test_joint_steps_bring_the_tip_to_a_place_near_by(tool_m: float) -> None:
+    place, normal = goals(50, tilt=0.2)
+    q = torch.nn.functional.pad(arm.postures(place + tool_m * normal, normal)[:, 0], (0, 1))
+    wanted = place + torch.tensor([0.02, -0.03, 0.01])
+    for _ in range(8):
+        tip = arm.tip_of(flange_motion(q), tool_m)
+        q = q + arm.joint_step(tip, wanted - tip.position, normal)
+    tip = arm.tip_of(flange_motion(q), tool_m)
+    np.testing.assert_allclose(tip.position, wanted, atol=2e-4)
+    np.testing.assert_allclose(tip.rotation[:, :, 2], -normal, atol=2e-3)
+
+
+@pytest.mark.parametrize("doubt_m", [0.0, 0.02])
+def test_the_tip_stays_above_where_the_goal_may_be(doubt_m: float) -> None:
+    place, normal = goals(50, tilt=0.2)
+    least = arm.DOUBTS * doubt_m - arm.BEYOND_M
+    too_low = place + (least - 0.04) * normal
+    q = torch.nn.functional.pad(arm.postures(too_low, normal)[:, 0], (0, 1))
+    doubt = torch.full((50, 1), doubt_m)
+    kept = arm.kept_above(q, place, normal, doubt, 0.0)
+    height = ((flange_motion(kept).position - place) * normal).sum(dim=1)
+    np.testing.assert_allclose(height, least, atol=4e-3)
+
+
+def test_a_tip_that_is_high_enough_or_far_beside_is_left_alone() -> None:
+    place, normal = goals(50, tilt=0.2)
+    q = torch.nn.functional.pad(arm.postures(place + 0.01 * normal, normal)[:, 0], (0, 1))
+    doubt = torch.zeros(50, 1)
+    assert (arm.kept_above(q, place, normal, doubt, 0.0) == q).all()
+    side = torch.linalg.cross(normal, UP.expand(50, 3) + 0.1, dim=1)
+    far = place + 0.3 * side / side.norm(dim=1, keepdim=True) + 0.1 * normal
+    assert (arm.kept_above(q, far, normal, doubt, 0.0) == q).all()
