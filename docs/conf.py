@@ -39,7 +39,7 @@ napoleon_use_ivar = True
 suppress_warnings = ["ref.python"]
 
 _OUTSIDE = re.compile(
-    r"\[([^\]]+)\]\(\.\./((?:(?:tasks|datasets|policies|eval|tests|hvs_suite)/|README)[^)]*)\)"
+    r"\[([^\]]+)\]\((?:\.\./)+((?:(?:tasks|datasets|policies|eval|tests|hvs_suite)/|README)[^)]*)\)"
 )
 
 

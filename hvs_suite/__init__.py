@@ -9,6 +9,15 @@
 as ``hvs_suite/<name>-v<version>``.
 """
 
+import os
+import platform
+
+if platform.machine() in ("x86_64", "AMD64"):
+    # OpenBLAS has kernels for each generation of processors, which round differently, and a fit
+    # that ends there ends elsewhere: results of servo on surface came out otherwise on another
+    # machine. These run wherever AVX2 does. NumPy asks when it loads; who has set it knows why.
+    os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
+
 from hvs_suite.gym import register
 from hvs_suite.registry import TASKS, load
 
