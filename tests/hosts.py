@@ -63,6 +63,8 @@ class Hosts:
         self.address = f"{self.address_of['head']}:{PORT}"
         self._environment = {
             **os.environ,
+            # Who plays on this machine alone tells Ray so, and whoever comes after in this process.
+            "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "1",
             # Who has no token is refused; each cluster has its own.
             "RAY_AUTH_MODE": "token",
             "RAY_AUTH_TOKEN": secrets.token_hex(32),
