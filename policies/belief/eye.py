@@ -11,8 +11,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-FEATURE_SIZE = 28
-"""Cells along the side of a feature map, about."""
+from hvs_suite.policies.network.network import strides
+
 PATCH_SIZE = 8
 PATCH_CHANNELS = 16
 PATCH_DIAMETERS = 2.5
@@ -30,24 +30,6 @@ UV, LOG_DIAMETER, VISIBLE, LOG_SIGMA_UV, LOG_SIGMA_SIZE, SLOPE, LOG_SIGMA_SLOPE 
 """What a sighting (B, 9) holds: the target's centre in [-1, 1] (u right, v down), the logarithm of
 its apparent diameter in image widths, the logit that it is in view, x and y of its normal in the
 camera's optical frame, and the logarithms of the standard deviations of these."""
-
-
-def strides(side: int) -> tuple[int, ...]:
-    """Strides of 4, 3 or 2 px that bring an image to about `FEATURE_SIZE` cells.
-
-    Args:
-        side: Side of the square image (px).
-
-    Returns:
-        Strides of the down-sampling convolutions; empty for tiny images.
-    """
-    factor = max(1, round(side / FEATURE_SIZE))
-    plan: list[int] = []
-    while factor > 1:
-        step = 3 if factor % 3 == 0 else 2
-        plan.append(step)
-        factor = round(factor / step)
-    return tuple(sorted(plan, reverse=True))
 
 
 class Eye(nn.Module):
