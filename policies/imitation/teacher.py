@@ -1,5 +1,6 @@
 """How a network is taught from demonstrations: what the training loop asks of either kind."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -58,6 +59,34 @@ class Teacher(Protocol):
         """Write the checkpoint."""
 
 
+def held_out_means(
+    policy: nn.Module,
+    demonstrations: Demonstrations,
+    losses: Callable[[npt.NDArray[np.int64]], Parts],
+) -> Parts:
+    """Mean losses over frames spread over the held-out episodes; empty if there are none.
+
+    Args:
+        policy: In evaluation mode meanwhile.
+        demonstrations: Say which episodes are held out.
+        losses: Of some frames, by name.
+    """
+    indices = demonstrations.held_out
+    if not len(indices):
+        return {}
+    spread = np.linspace(0, len(indices) - 1, min(len(indices), HELD_OUT_FRAMES))
+    indices = indices[spread.astype(np.int64)]
+    sums: Parts = {}
+    policy.eval()
+    with torch.no_grad():
+        for first in range(0, len(indices), HELD_OUT_BATCH):
+            some = indices[first : first + HELD_OUT_BATCH]
+            for name, value in losses(some).items():
+                sums[name] = sums.get(name, 0.0) + value * len(some)
+    policy.train()
+    return {name: value / len(indices) for name, value in sums.items()}
+
+
 class FrameTeacher:
     """Teaches `HvsPolicy` from single frames, and its head from more of them without images.
 
@@ -100,21 +129,12 @@ class FrameTeacher:
 
     def held_out(self) -> Parts:
         """As `Teacher.held_out`."""
-        indices = self.demonstrations.held_out
-        if not len(indices):
-            return {}
-        spread = np.linspace(0, len(indices) - 1, min(len(indices), HELD_OUT_FRAMES))
-        indices = indices[spread.astype(np.int64)]
-        sums: dict[str, float] = {}
-        self.policy.eval()
-        with torch.no_grad():
-            for first in range(0, len(indices), HELD_OUT_BATCH):
-                part = indices[first : first + HELD_OUT_BATCH]
-                loss, parts = self.policy(self.demonstrations.batch(part))
-                for name, value in {"loss": loss.item(), **parts}.items():
-                    sums[name] = sums.get(name, 0.0) + value * len(part)
-        self.policy.train()
-        return {name: value / len(indices) for name, value in sums.items()}
+
+        def losses(rows: npt.NDArray[np.int64]) -> Parts:
+            loss, parts = self.policy(self.demonstrations.batch(rows))
+            return {"loss": loss.item(), **parts}
+
+        return held_out_means(self.policy, self.demonstrations, losses)
 
     def save(self, out: Path) -> None:
         """As `Teacher.save`."""

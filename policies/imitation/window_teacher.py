@@ -22,7 +22,7 @@ from hvs_suite.policies.belief.recorded import recorded, recorded_keys
 from hvs_suite.policies.imitation.dagger import round_shares
 from hvs_suite.policies.imitation.demonstrations import Demonstrations
 from hvs_suite.policies.imitation.settings import Settings
-from hvs_suite.policies.imitation.teacher import HELD_OUT_BATCH, HELD_OUT_FRAMES, Parts
+from hvs_suite.policies.imitation.teacher import Parts, held_out_means
 from hvs_suite.policies.imitation.windows import Rows, WindowPool
 from hvs_suite.policies.network.dataset import EPISODE
 from hvs_suite.policies.network.geometry import flange_motion
@@ -136,21 +136,12 @@ class WindowTeacher:
 
     def held_out(self) -> Parts:
         """As `Teacher.held_out`; of the eyes alone, whose frames are seen for the first time."""
-        indices = self.demonstrations.held_out
-        if not len(indices):
-            return {}
-        spread = np.linspace(0, len(indices) - 1, min(len(indices), HELD_OUT_FRAMES))
-        indices = indices[spread.astype(np.int64)]
-        sums: Parts = {}
-        self.policy.eval()
-        with torch.no_grad():
-            for first in range(0, len(indices), HELD_OUT_BATCH):
-                some = indices[first : first + HELD_OUT_BATCH]
-                loss, parts = self._eye_lesson(some)
-                for name, value in {"loss": loss, **parts}.items():
-                    sums[name] = sums.get(name, 0.0) + value.item() * len(some)
-        self.policy.train()
-        return {name: value / len(indices) for name, value in sums.items()}
+
+        def losses(rows: Rows) -> Parts:
+            loss, parts = self._eye_lesson(rows)
+            return {name: value.item() for name, value in {"loss": loss, **parts}.items()}
+
+        return held_out_means(self.policy, self.demonstrations, losses)
 
     def save(self, out: Path) -> None:
         """As `Teacher.save`."""
