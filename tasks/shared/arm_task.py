@@ -174,6 +174,7 @@ class ArmTask(composer.Task):
         self._appearance = appearance.Appearance(physics, cell, spec)
         self._rays = np.zeros(mujoco.mjNGROUP, np.uint8)
         self._rays[: SHELL_GROUP + 1] = 1
+        self._near_m = float(physics.model.vis.map.znear * physics.model.stat.extent)
 
     def prepare(self, index: int) -> None:
         """Draw scenario ``index``."""
@@ -440,7 +441,8 @@ class ArmTask(composer.Task):
         ax, ay, az, bx, by, bz, cx, cy, cz = data.cam_xmat[camera.id].tolist()
         dx, dy, dz = (centre - eye).tolist()
         depth = -(az * dx + bz * dy + cz * dz)
-        if depth <= 0.0:
+        # What is nearer than the near plane is not drawn; an eye may sit within its own bracket.
+        if depth <= self._near_m:
             return np.zeros(4)
         focal, middle = camera.K[0, 0].item(), camera.K[0, 2].item()
         u = focal * (ax * dx + bx * dy + cx * dz) / depth + middle
@@ -449,7 +451,10 @@ class ArmTask(composer.Task):
         x = 2.0 * (u + 0.5) / camera.resolution - 1.0
         y = 2.0 * (v + 0.5) / camera.resolution - 1.0
         seen = max(abs(x), abs(y)) <= 1.0 and (eye - centre) @ keypoint.normal > 0
-        if not seen or self._is_occluded(physics, eye, centre, own=name == "eih"):
+        if not seen:
+            return np.zeros(4)
+        begin = eye + (centre - eye) * (self._near_m / depth)
+        if self._is_occluded(physics, begin, centre, own=name == "eih"):
             return np.zeros(4)
         diameter = focal * keypoint.diameter_m / depth / camera.resolution
         return np.array([x, y, diameter, 1.0])
@@ -530,15 +535,15 @@ class ArmTask(composer.Task):
         return view
 
     def _is_occluded(
-        self, physics: mjcf.Physics, eye: FloatArray, centre: FloatArray, *, own: bool
+        self, physics: mjcf.Physics, begin: FloatArray, centre: FloatArray, *, own: bool
     ) -> bool:
-        ray = centre - eye
+        ray = centre - begin
         hit = np.zeros(1, np.int32)
         # The eye-in-hand camera sits in the flange: its own link must not count.
         length = mujoco.mj_ray(
             physics.model.ptr,
             physics.data.ptr,
-            eye,
+            begin,
             ray,
             self._rays,
             1,

@@ -165,6 +165,24 @@ def test_nothing_but_peg_and_bushing_may_touch(env: Environment) -> None:
     assert env.info["errors"][PEAK_FORCE] == 0.0
 
 
+def test_the_eye_in_hand_is_said_to_see_the_bushing_that_the_peg_stands_over(
+    env: Environment,
+) -> None:
+    """It sits in a bracket, which its pictures do not show."""
+    hand = Hand(env, aside_m=0.0)
+    hand.set_point = hand.model.goal_configurations_at_tool_angle(hand.place + 0.05 * UP, UP, 0.0)[
+        0
+    ]
+    env.task.place(env.physics, hand.set_point)
+    u, v, diameter, seen = env.privileged()["target_eih"]
+    assert seen == 1.0
+    assert abs(u) < 0.1
+    assert 0.15 < diameter < 0.3
+    ids = env.physics.render(112, 112, camera_id=env.task.cameras["eih"].id, segmentation=True)
+    rows, _ = np.nonzero(ids[..., 0] == env.task.family.marker_geom)
+    assert rows.mean() == pytest.approx(0.5 * (v + 1.0) * 112, abs=2.0)
+
+
 def test_the_hidden_error_is_in_no_observation_and_not_in_the_pictures() -> None:
     with hvs_suite.load("insert-feel", split="test") as env:
         seen = env.reset(scenario=3).observation
