@@ -47,6 +47,9 @@ GATES = 4
 FORGET_SLOPE = 5.0
 FORGET_AT = 3.2
 """A share of 1e-7 is forgotten where the gate says 0: of half a metre, a tenth of a millimetre."""
+AHEAD_S = 0.2
+"""For how long the arm acts on a velocity that is believed (s): it is there one to two control
+steps after it was sent."""
 FEATURES_A_CAMERA = 9
 FEATURES = 12
 
@@ -325,7 +328,7 @@ def belief_loss(
     parts = {
         "place": torch.asinh(e.abs() / scale_m).mean(),
         "place_nll": 0.05 * place_nll.mean(),
-        "velocity": 0.3 * torch.asinh(off[:, 3:].abs() / (10.0 * scale_m)).mean(),
+        "velocity": 0.5 * torch.asinh(AHEAD_S * off[:, 3:].abs() / scale_m).mean(),
         "slope_nll": 0.05 * slope_nll.mean(),
         "slope": 0.3 * torch.asinh((slope - belief[:, TILT]).abs() / 0.02).mean(),
     }
