@@ -249,17 +249,19 @@ def take_eyes(policy: "HvsPolicy | HvsBeliefPolicy", folder: Path) -> None:
         raise PolicyError(f"{folder} holds a policy of type {config.get('type')}, not {kind}")
     loaded = load_network(folder, config) if kind == "hvs" else load_belief_network(folder)
     others, eyes = loaded.eyes, policy.network.eyes
-    alike = [
-        name for name in eyes if name in others and _shapes(eyes[name]) == _shapes(others[name])
-    ]
+    alike = [name for name in eyes if name in others and _fits(eyes[name], others[name])]
     if not alike:
         raise PolicyError(
             f"{folder} has no eyes that fit {', '.join(eyes)}: their layers depend on the images' "
             "sides and channels"
         )
     for name in alike:
-        eyes[name].load_state_dict(others[name].state_dict())
+        eyes[name].load_state_dict(others[name].state_dict(), strict=False)
 
 
-def _shapes(module: nn.Module) -> dict[str, torch.Size]:
-    return {name: weight.shape for name, weight in module.state_dict().items()}
+def _fits(eye: nn.Module, other: nn.Module) -> bool:
+    """Whether all layers of an eye that both have are alike; what says which target is meant, and
+    has no counterpart, begins afresh."""
+    mine, theirs = eye.state_dict(), other.state_dict()
+    common = mine.keys() & theirs.keys()
+    return bool(common) and all(mine[name].shape == theirs[name].shape for name in common)
