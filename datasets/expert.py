@@ -47,7 +47,7 @@ class Expert:
             )
         self._env = env
         self._planner = Planner(spec.control_period_s, plain=plain, embodiment=spec.embodiment)
-        self._insertion = GuardedInsertion(spec.control_period_s, spec.embodiment)
+        self._insertion = GuardedInsertion(spec.control_period_s, spec.embodiment, plain=plain)
         self._period_s = spec.control_period_s
         self._delay_s = spec.latency_steps * spec.control_period_s
 

@@ -37,6 +37,14 @@ _PUSHES = 6
 _STOPS_RAD = (0.0, 0.05, 0.3)
 _CLEAR_MM = 8.0
 """Nearer to the axis than the first and lower than the second, the only way is up."""
+FUNNEL_MM = 40.0
+"""From how far beside the axis a learnable way goes down along the funnel."""
+FUNNEL_TILT_DEG = 10.0
+FUNNEL_SLOPE = 4.0
+ASIDE_MM = 15.0
+"""Largest step towards the axis."""
+SETTLED_SHARE = 1.0 / 3.0
+"""Of how far off a tip may be and still be caught: so near to the axis it goes into the hole."""
 
 
 class GuardedInsertion:
@@ -45,11 +53,12 @@ class GuardedInsertion:
     Args:
         period_s: Control period (s).
         embodiment: The robot.
+        plain: As in `Planner`.
     """
 
-    def __init__(self, period_s: float, embodiment: Embodiment) -> None:
+    def __init__(self, period_s: float, embodiment: Embodiment, *, plain: bool = False) -> None:
         self._kinematics = kinematics(embodiment)
-        self._planner = Planner(period_s, embodiment=embodiment)
+        self._planner = Planner(period_s, plain=plain, embodiment=embodiment)
 
     def next_set_point(
         self, joints: FloatArray, velocity: FloatArray, set_point: FloatArray, goal: Goal
@@ -79,6 +88,55 @@ class GuardedInsertion:
             step = min(step, max(height - GATE_MM, 0.0))
         depth_m = max(0.001 * (height - step), goal.standoff_m)
         return self.straight(set_point, goal.target + depth_m * goal.normal, goal)
+
+    def learnable_set_point(
+        self,
+        joints: FloatArray,
+        velocity: FloatArray,
+        set_point: FloatArray,
+        goal: Goal,
+        caught_mm: float,
+    ) -> FloatArray:
+        """As `next_set_point`, but it changes little where the arm stands a little elsewhere.
+
+        Up or down, by another posture or not: `next_set_point` decides that at half a millimetre
+        beside the axis, which a policy does not see so exactly; it learns the mean of both, and
+        hovers. This way goes down along a funnel: the farther from the axis, the higher it stays.
+
+        Args:
+            joints: Now, (7,) rad.
+            velocity: Of the joints, (7,) rad/s.
+            set_point: Now, (7,) rad.
+            goal: In the hole: its target is the middle of the mouth, its standoff negative.
+            caught_mm: How far beside the axis the mouth still catches the tip.
+
+        Returns:
+            (7,) rad.
+        """
+        sent, arm = self.errors(set_point, goal), self.errors(joints, goal)
+        height, within = sent[HEIGHT], SETTLED_SHARE * caught_mm
+        if (
+            sent[LATERAL] > FUNNEL_MM
+            or height > ABOVE_MM + FUNNEL_MM
+            or sent[TILT] > FUNNEL_TILT_DEG
+        ):
+            above = dataclasses.replace(goal, standoff_m=0.001 * ABOVE_MM)
+            return self._planner.next_set_point(joints, velocity, above, onward=goal)
+        off = max(sent[LATERAL], arm[LATERAL], within * arm[TILT] / SETTLED_DEG)
+        least = 1000.0 * goal.standoff_m
+        if arm[HEIGHT] > 0.0:
+            # Through the mouth within one tolerance, above the gate from two on.
+            least += (GATE_MM - least) * min(max(off / within - 1.0, 0.0), 1.0)
+            least += min(FUNNEL_SLOPE * max(off - 2.0 * within, 0.0), ABOVE_MM - GATE_MM)
+        step = min(max(_BRAKING * (height - GATE_MM), SLOW_MM), FAST_MM)
+        height = max(height - step, least) if height > least else min(height + FAST_MM, least)
+        _, tip = self._kinematics.tip_pose(set_point)
+        beside = tip - goal.target
+        beside -= (beside @ goal.normal) * goal.normal
+        left = max(sent[LATERAL] - ASIDE_MM, 0.0) / max(sent[LATERAL], ASIDE_MM)
+        return self.straight(
+            set_point, goal.target + left * beside + 0.001 * height * goal.normal, goal
+        )
 
     def errors(self, q: FloatArray, goal: Goal) -> dict[str, float]:
         """Lateral error (mm), height above the mouth (mm) and tilt (deg) of the tip at q (7,)."""

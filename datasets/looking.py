@@ -15,6 +15,8 @@ A target that is suddenly elsewhere is a new one, of which nothing has been seen
 
 And where the arm may start anywhere, it goes there in one of two plain postures (see
 `hvs_suite.datasets.planner.Planner`).
+
+Into a hole it goes down along a funnel (see `hvs_suite.datasets.insertion`).
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ import numpy.typing as npt
 from hvs_suite.datasets.expert import Expert
 from hvs_suite.registry import TASKS
 from hvs_suite.tasks.shared.goal import Goal
+from hvs_suite.tasks.shared.peg_and_bushing import PegSpec
 from hvs_suite.tasks.shared.spec import CAMERA_NAMES
 
 if TYPE_CHECKING:
@@ -83,6 +86,9 @@ class Demonstrator(Expert):
             ahead = self._planner.towards_posture(q, velocity, self._next_look(q))
             if ahead is not None:
                 return ahead
+        spec, goal = self._env.spec, self._goal_in(0.0)
+        if isinstance(spec, PegSpec) and goal.standoff_m < 0.0:
+            return self._insertion.learnable_set_point(q, velocity, set_point, goal, spec.caught_mm)
         return super()._next_set_point(q, velocity, set_point)
 
     def _goal_in(self, ahead_s: float) -> Goal:

@@ -213,4 +213,4 @@ def save_checkpoint(policy: HvsBeliefPolicy, folder: Path) -> None:
         make_hvs_belief_pre_post_processors,
     )
 
-    write_checkpoint(policy, make_hvs_belief_pre_post_processors(policy.config), folder)
+    write_checkpoint(policy, make_hvs_belief_pre_post_processors(policy.config), folder, half=True)

@@ -260,8 +260,7 @@ def take_eyes(policy: "HvsPolicy | HvsBeliefPolicy", folder: Path) -> None:
 
 
 def _fits(eye: nn.Module, other: nn.Module) -> bool:
-    """Whether all layers of an eye that both have are alike; what says which target is meant, and
-    has no counterpart, begins afresh."""
+    """Whether all layers that both eyes have are alike; one alone may be told what is meant."""
     mine, theirs = eye.state_dict(), other.state_dict()
     common = mine.keys() & theirs.keys()
     return bool(common) and all(mine[name].shape == theirs[name].shape for name in common)

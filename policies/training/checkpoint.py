@@ -9,13 +9,17 @@ from typing import Any
 from hvs_suite.errors import OutputError, first_line
 
 
-def write_checkpoint(policy: Any, processors: Iterable[Any], folder: Path) -> None:
+def write_checkpoint(
+    policy: Any, processors: Iterable[Any], folder: Path, *, half: bool = False
+) -> None:
     """Write a checkpoint that LeRobot and the suite load, each file whole or not at all.
 
     Args:
         policy: A LeRobot policy.
         processors: Its pre- and post-processor.
         folder: Gets ``config.json``, ``model.safetensors`` and the two processors.
+        half: Write single-precision weights in half precision, which takes half the room; they are
+            single again once they are loaded.
 
     Raises:
         OutputError: It cannot be written; what stood there before still does.
@@ -27,6 +31,8 @@ def write_checkpoint(policy: Any, processors: Iterable[Any], folder: Path) -> No
         with tempfile.TemporaryDirectory(dir=folder, prefix=".checkpoint-") as name:
             scratch = Path(name)
             policy.save_pretrained(scratch)
+            if half:
+                _halve(scratch / "model.safetensors")
             for processor in processors:
                 processor.save_pretrained(scratch)
             # LeRobot reads the type before it knows the class; keep the file stable for diffs.
@@ -38,3 +44,14 @@ def write_checkpoint(policy: Any, processors: Iterable[Any], folder: Path) -> No
                 path.replace(folder / path.name)
     except (OSError, SafetensorError) as error:
         raise OutputError(f"cannot write {folder}: {first_line(error)}") from error
+
+
+def _halve(path: Path) -> None:
+    import torch
+    from safetensors.torch import load_file, save_file
+
+    weights = {
+        name: weight.half() if weight.dtype == torch.float32 else weight
+        for name, weight in load_file(path).items()
+    }
+    save_file(weights, path, {"format": "pt"})

@@ -92,9 +92,14 @@ class PegSpec(RingSpec):
         return BOTTOM_M + self.hole_depth_m
 
     @property
+    def caught_mm(self) -> float:
+        """How far beside the axis the mouth still catches the peg (mm)."""
+        return self.clearance_mm + self.chamfer_mm
+
+    @property
     def hole_share(self) -> float:
         """Share of the bushing's face that its mouth takes."""
-        mouth_m = self.peg_diameter_m + 0.002 * (self.clearance_mm + self.chamfer_mm)
+        mouth_m = self.peg_diameter_m + 0.002 * self.caught_mm
         return (mouth_m / self.target_diameter_m) ** 2
 
 

@@ -62,12 +62,11 @@ def new_policy(task: str):
 @pytest.fixture(scope="module", params=PLAYED)
 def played(request, tmp_path_factory):
     """A task, a policy for it, and its checkpoint."""
-    from hvs_suite.policies.hvs_belief.modeling_hvs_belief import save_checkpoint
+    from hvs_suite.policies.hvs_belief.modeling_hvs_belief import HvsBeliefPolicy, save_checkpoint
 
     folder = tmp_path_factory.mktemp(request.param)
-    policy = new_policy(request.param)
-    save_checkpoint(policy, folder)
-    return TASKS[request.param], policy, folder
+    save_checkpoint(new_policy(request.param), folder)
+    return TASKS[request.param], HvsBeliefPolicy.from_pretrained(folder), folder
 
 
 @pytest.fixture(scope="module")
@@ -133,6 +132,22 @@ def test_a_saved_policy_is_the_same_policy(played):
         torch.testing.assert_close(
             again.select_action(batch), policy.select_action(batch), atol=0, rtol=0
         )
+
+
+def test_weights_are_kept_in_half_precision(played, tmp_path):
+    from hvs_suite.policies.hvs_belief.modeling_hvs_belief import HvsBeliefPolicy, save_checkpoint
+
+    spec, policy, folder = played
+    size = (folder / "model.safetensors").stat().st_size
+    assert size < 2.2 * sum(weight.numel() for weight in policy.parameters())
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        fresh = new_policy(spec.name)
+    save_checkpoint(fresh, tmp_path)
+    kept = HvsBeliefPolicy.from_pretrained(tmp_path)
+    for mine, theirs in zip(kept.parameters(), fresh.parameters(), strict=True):
+        assert mine.dtype == theirs.dtype
+        torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=1e-7)
 
 
 def test_goal_and_wrench_are_named_in_the_configuration(played):
