@@ -10,6 +10,7 @@ from torch import Tensor
 from hvs_suite.cell.robot import (
     BASE_TO_SHOULDER_M,
     ELBOW_TO_WRIST_M,
+    JOINT_ACCELERATION_RAD_S2,
     JOINT_RANGE_RAD,
     JOINT_SPEED_RAD_S,
     SHOULDER_TO_ELBOW_M,
@@ -152,6 +153,27 @@ def way_to_posture(q: Tensor, flange: Tensor, normal: Tensor) -> tuple[Tensor, T
     nearer = torch.where(within, times, times + UNREACHABLE_S).argmin(dim=1)
     row = torch.arange(len(q), device=q.device)
     return ways[row, nearer], times[row, nearer, None], within[row, nearer, None].to(q)
+
+
+def share_of_way(turns: Tensor, period_s: float) -> Tensor:
+    """Which part of a way the next control step goes, so that all joints can stop at its end.
+
+    A joint with x left to go can stop if its speed v satisfies v^2 / (2 a) + v T / 2 <= x; all go
+    the same part of their way, the least that one of them can.
+
+    Args:
+        turns: That are left of A1 to A6, (B, 6) rad.
+        period_s: Control period T (s).
+
+    Returns:
+        (B, 1), 0 to 1.
+    """
+    fastest = torch.as_tensor(JOINT_SPEED_RAD_S[:-1]).to(turns)
+    braking = torch.as_tensor(JOINT_ACCELERATION_RAD_S2[:-1]).to(turns)
+    left = turns.abs().clamp(min=1e-6)
+    half = 0.5 * braking * period_s
+    speed = torch.minimum(torch.sqrt(half**2 + 2.0 * braking * left) - half, fastest)
+    return (speed * period_s / left).clamp(max=1.0).amin(dim=1, keepdim=True)
 
 
 def kept_above(

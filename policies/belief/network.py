@@ -6,7 +6,7 @@ learns from demonstrations.
 
 The head thinks in the goal's frame first: a small network says to which point by the goal the tip
 should go next, damped least squares turn that into a joint step, the ways to two plain postures
-over the goal are put beside it, and a second network mixes them and corrects the sum, on a
+over the goal are put beside it, and a second network weighs them and corrects their mean, on a
 logarithmic scale on which a micrometre and a metre both teach something.
 """
 
@@ -132,16 +132,18 @@ class BeliefNetwork(nn.Module):
         self.width = width
         n_ways = len(HEIGHTS_M)
         way_width = n_ways * (2 * (N_JOINTS - 1) + 2)
-        # To which point by the goal: sideways (two) and along the normal, and how far ahead.
-        guide_last = nn.Linear(128, 4)
+        # To which point by the goal: sideways (two) and along the normal, how far ahead, and what
+        # is added for where the tip is, and where it was sent.
+        guide_last = nn.Linear(128, 6)
         nn.init.zeros_(guide_last.weight)
         nn.init.zeros_(guide_last.bias)
         self.guide = nn.Sequential(
             nn.Linear(width, 128), nn.SiLU(), nn.Linear(128, 128), nn.SiLU(), guide_last
         )
         self.lead_s = nn.Parameter(torch.tensor(0.1))
+        self.feedback = nn.Parameter(torch.zeros(2))
         full = width + way_width + N_JOINTS * (1 + n_ways)
-        last = nn.Linear(hidden, N_JOINTS + 1 + n_ways)
+        last = nn.Linear(hidden, N_JOINTS + 1 + 1 + n_ways)
         with torch.no_grad():
             last.weight.mul_(0.1)
             last.bias.zero_()
@@ -154,9 +156,6 @@ class BeliefNetwork(nn.Module):
             nn.SiLU(),
             last,
         )
-        gains = torch.zeros(1 + n_ways, N_JOINTS)
-        gains[0], gains[1] = 0.5, 0.5
-        self.gains = nn.Parameter(gains)
 
     # --- the cell ---
 
@@ -281,25 +280,30 @@ class BeliefNetwork(nn.Module):
         by = scale * torch.sinh(guided[:, :3].clamp(-bound, bound))
         side = sent.rotation[:, :, :2]
         side = side - normal[:, :, None] * (normal[:, None] @ side)
-        lead = self.lead_s * (1.0 + 0.5 * torch.tanh(guided[:, 3:]))
+        lead = self.lead_s * (1.0 + 0.5 * torch.tanh(guided[:, 3:4]))
         ahead = goal + lead * speed + 0.5 * lead**2 * bend
         waypoint = ahead + (side @ by[:, :2, None])[:, :, 0] + by[:, 2:] * normal
+        # The arm trails its set point. What is sent farther, so that it arrives, is linear in where
+        # it stands: exactly what a network on a logarithmic scale says only roughly.
+        gain = self.feedback + 0.5 * torch.tanh(guided[:, 4:])
+        waypoint = waypoint + gain[:, :1] * (ahead - here.position)
+        waypoint = waypoint + gain[:, 1:] * (ahead - sent.position)
         proposals = [arm.joint_step(sent, waypoint - sent.position, normal)]
         ways = []
         tool = self.cell.tool_length_m
         for height in HEIGHTS_M:
             over = (ahead + (height + tool) * normal).detach()
             turns, time_s, within = arm.way_to_posture(set_point, over, normal.detach())
-            step = turns * (self.cell.period_s / time_s.clamp(min=self.cell.period_s))
+            step = turns * arm.share_of_way(turns, self.cell.period_s)
             proposals.append(F.pad(step, (0, 1)))
             ways += [torch.asinh(turns / scale), time_s, within]
             ways.append(torch.asinh(step / scale))
         said = [torch.asinh(p / scale) for p in proposals]
         out = self.head(torch.cat([inputs, *ways, *said], dim=1))
-        mix = out[:, N_JOINTS:]
-        total = out[:, :N_JOINTS]
-        for k, each in enumerate(said):
-            total = total + (self.gains[k] + mix[:, k : k + 1]) * each
+        correction, is_corrected, weights = out.split([N_JOINTS, 1, len(proposals)], dim=1)
+        # Weights and gate can become whole: near the goal one proposal is right as it is.
+        mean = (weights.softmax(dim=1)[:, :, None] * torch.stack(proposals, dim=1)).sum(dim=1)
+        total = torch.asinh(mean / scale) + torch.sigmoid(is_corrected) * correction
         return total
 
     def _in_goal_frame(self, tip: FlangeMotion, goal: Tensor, normal: Tensor) -> Tensor:
@@ -339,7 +343,10 @@ class BeliefNetwork(nn.Module):
         Returns:
             Joint position targets in units of the joint range, (B, 7) in [-1, 1].
         """
-        target = memory[:, SET_POINT].float() + self.to_step(out)
+        # The set point goes no faster; what is farther would be let go of later, if at all.
+        longest = self.joint_speed * self.cell.period_s
+        step = torch.maximum(torch.minimum(self.to_step(out), longest), -longest)
+        target = memory[:, SET_POINT].float() + step
         goal, normal = self._goal(memory)
         P = memory[:, COVARIANCE].view(-1, N_MOTION, N_MOTION)[:, PLACE, PLACE].float()
         doubt = (normal * (P @ normal[:, :, None])[:, :, 0]).sum(dim=1, keepdim=True)
