@@ -177,21 +177,28 @@ def share_of_way(turns: Tensor, period_s: float) -> Tensor:
 
 
 def kept_above(
-    q: Tensor, goal: Tensor, normal: Tensor, doubt_m: Tensor, tool_length_m: float
+    q: Tensor,
+    goal: Tensor,
+    normal: Tensor,
+    doubt_m: Tensor,
+    lowest_m: Tensor,
+    tool_length_m: float,
 ) -> Tensor:
     """The joint angles nearest to given ones at which the tip is not beyond its goal.
 
     What comes down fast, one joint against another, is easily some centimetres too low, and touches
     what the goal is above. So near the goal the tip stays on its side: its height along the normal
     is at least `DOUBTS` times how well the goal's is known, less `BEYOND_M`; farther than
-    `BESIDE_M` beside it, as much less as it is farther. Gauss-Newton on that height, damped as
-    `joint_step` is; angles that are high enough are left alone.
+    `BESIDE_M` beside it, as much less as it is farther. And nowhere is it lower than it ever was in
+    the demonstrations. Gauss-Newton on these heights, damped as `joint_step` is; angles that are
+    high enough are left alone.
 
     Args:
         q: Joint angles, (B, 7) rad.
         goal: Of the tip, (B, 3) m.
         normal: Unit normal there, (B, 3).
         doubt_m: Standard deviation of the goal along it, (B, 1) m.
+        lowest_m: Least height of the tip over the base, () m.
         tool_length_m: From the flange to the tip (m).
 
     Returns:
@@ -203,7 +210,13 @@ def kept_above(
         height = (offset * normal).sum(dim=1, keepdim=True)
         lateral = (offset - height * normal).norm(dim=1, keepdim=True)
         least = DOUBTS * doubt_m - BEYOND_M - (lateral - BESIDE_M).clamp(min=0.0)
-        rise = (normal[:, None] @ tip.jacobian[:, :3])[:, 0]
-        gain = rise.square().sum(dim=1, keepdim=True) + LIFT_DAMPING_M**2
-        q = q + rise * ((least - height).clamp(min=0.0) / gain)
+        q = q + _lift((normal[:, None] @ tip.jacobian[:, :3])[:, 0], least - height)
+        tip = tip_of(flange_motion(q), tool_length_m)
+        q = q + _lift(tip.jacobian[:, 2], lowest_m - tip.position[:, 2:])
     return q
+
+
+def _lift(rise: Tensor, missing_m: Tensor) -> Tensor:
+    """Joint step (B, 7) that makes up for a missing height (B, 1), which rises by (B, 7) m/rad."""
+    gain = rise.square().sum(dim=1, keepdim=True) + LIFT_DAMPING_M**2
+    return rise * (missing_m.clamp(min=0.0) / gain)

@@ -29,6 +29,7 @@ from hvs_suite.policies.belief.belief import (
     TILT_VARIANCE,
     VELOCITY,
     Belief,
+    Prior,
     View,
 )
 from hvs_suite.policies.belief.eye import LOG_DIAMETER, UV, VISIBLE, Eye
@@ -38,6 +39,9 @@ from hvs_suite.policies.network.geometry import FlangeMotion
 N_JOINTS = 7
 HEIGHTS_M = (0.0, 0.05, 0.15)
 """Above the goal, along its normal: the plain postures that the head is shown."""
+LOWER_M = 0.002
+"""The tip may go so much lower than it ever was in the demonstrations (m): joints are measured with
+errors."""
 RECENT_SIZE = 4
 """What is remembered beside belief and set point: for how long each camera has not seen the target
 (two), and a trace of what was forgotten (two)."""
@@ -104,6 +108,7 @@ class BeliefNetwork(nn.Module):
 
     joint_range: Tensor
     joint_speed: Tensor
+    lowest_m: Tensor
 
     def __init__(self, shape: Shape, cell: CellModel) -> None:
         super().__init__()
@@ -116,6 +121,7 @@ class BeliefNetwork(nn.Module):
             }
         )
         self.belief = Belief(cameras, cell.period_s)
+        self.register_buffer("lowest_m", torch.tensor(-1.0))
         self.register_buffer(
             "joint_range", torch.tensor(JOINT_RANGE_RAD, dtype=torch.float32), persistent=False
         )
@@ -178,6 +184,16 @@ class BeliefNetwork(nn.Module):
     def look(self, images: Mapping[str, Tensor], goal: Tensor | None = None) -> dict[str, Tensor]:
         """Run the eyes: camera name to sightings (B, 9)."""
         return {name: eye(images[name], goal) for name, eye in self.eyes.items()}
+
+    def set_prior(self, prior: Prior, lowest_m: float) -> None:
+        """Copy what demonstrations say beforehand into the buffers that are saved with the weights.
+
+        Args:
+            prior: Of the belief.
+            lowest_m: Where the tip was lowest over the base (m).
+        """
+        self.belief.set_prior(prior)
+        self.lowest_m.fill_(lowest_m)
 
     # --- one step ---
 
@@ -351,7 +367,8 @@ class BeliefNetwork(nn.Module):
         P = memory[:, COVARIANCE].view(-1, N_MOTION, N_MOTION)[:, PLACE, PLACE].float()
         doubt = (normal * (P @ normal[:, :, None])[:, :, 0]).sum(dim=1, keepdim=True)
         doubt = doubt.clamp(min=0.0).sqrt()
-        target = arm.kept_above(target, goal, normal, doubt, self.cell.tool_length_m)
+        lowest = self.lowest_m - LOWER_M
+        target = arm.kept_above(target, goal, normal, doubt, lowest, self.cell.tool_length_m)
         return (target / self.joint_range).clamp(-1.0, 1.0)
 
     def _goal(self, memory: Tensor) -> tuple[Tensor, Tensor]:

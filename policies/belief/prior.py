@@ -7,7 +7,9 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from hvs_suite.policies.belief.arm import tip_of
 from hvs_suite.policies.belief.belief import ACCELERATION, N_MOTION, PLACE, VELOCITY, Prior, View
+from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
 from hvs_suite.policies.network.dataset import (
     EPISODE,
     GOAL_NORMAL,
@@ -15,6 +17,8 @@ from hvs_suite.policies.network.dataset import (
     GOAL_VELOCITY,
     TARGET_PREFIX,
 )
+from hvs_suite.policies.network.geometry import flange_motion
+from hvs_suite.policies.network.network import STATE
 
 WIDER = 1.5
 """Variances are so much larger than those of the demonstrations: scenes to come may lie beyond."""
@@ -82,6 +86,20 @@ def fit_prior(
         standoff_m=standoff,
         sizes={name: _size(place, targets[name], view) for name, view in views.items()},
     )
+
+
+def take_prior(network: BeliefNetwork, columns: Mapping[str, npt.NDArray[np.generic]]) -> None:
+    """Give a network what demonstrations say beforehand.
+
+    Args:
+        network: Gets it: the prior of its belief, and how low the tip goes.
+        columns: As in `fit_prior`, and ``observation.state`` (n, 14).
+    """
+    q = _double(columns[STATE])[:, :N_JOINTS]
+    motion = flange_motion(q)
+    prior = fit_prior(columns, network.views(motion), network.cell.period_s)
+    tip = tip_of(motion, network.cell.tool_length_m).position
+    network.set_prior(prior, float(tip[:, 2].min()))
 
 
 def _standoff(goal: Tensor, normal: Tensor, target: Tensor, view: View) -> float:

@@ -13,7 +13,7 @@ from hvs_suite.policies.belief.cell_model import cell_model
 from hvs_suite.policies.belief.eye import SIGHTING_SIZE
 from hvs_suite.policies.belief.lessons import Window, eye_lesson, window_lesson
 from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
-from hvs_suite.policies.belief.prior import fit_prior
+from hvs_suite.policies.belief.prior import take_prior
 from hvs_suite.policies.belief.recorded import Recorded, recorded, recorded_keys
 from hvs_suite.policies.belief.settings import as_numbers
 from hvs_suite.policies.hvs_belief.configuration_hvs_belief import HvsBeliefConfig
@@ -23,7 +23,6 @@ from hvs_suite.policies.network.dataset import (
     read_columns,
     read_manifest,
 )
-from hvs_suite.policies.network.geometry import flange_motion
 from hvs_suite.policies.network.network import IMAGE_PREFIX
 from hvs_suite.policies.trained_for import trained_for
 from hvs_suite.policies.training.checkpoint import write_checkpoint
@@ -73,9 +72,7 @@ class HvsBeliefPolicy(PreTrainedPolicy):
         columns = read_columns(manifest, [*recorded_keys(cameras), *further])
         self._recorded = recorded(columns, cameras, period_s)
         if with_prior:
-            q = torch.from_numpy(columns[OBS_STATE][:, :N_JOINTS]).double()
-            views = self.network.views(flange_motion(q))
-            self.network.belief.set_prior(fit_prior(columns, views, period_s))
+            take_prior(self.network, columns)
 
     def get_optim_params(self) -> Any:
         """All parameters, in one group."""

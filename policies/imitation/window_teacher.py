@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from torch import Tensor, nn
 
 from hvs_suite.errors import DatasetError
 from hvs_suite.policies.belief.lessons import eye_lesson, window_lesson
 from hvs_suite.policies.belief.network import N_JOINTS
-from hvs_suite.policies.belief.prior import fit_prior
+from hvs_suite.policies.belief.prior import take_prior
 from hvs_suite.policies.belief.recorded import recorded, recorded_keys
 from hvs_suite.policies.imitation.dagger import round_shares
 from hvs_suite.policies.imitation.demonstrations import Demonstrations
@@ -25,7 +24,6 @@ from hvs_suite.policies.imitation.settings import Settings
 from hvs_suite.policies.imitation.teacher import Parts, held_out_means
 from hvs_suite.policies.imitation.windows import Rows, WindowPool
 from hvs_suite.policies.network.dataset import EPISODE
-from hvs_suite.policies.network.geometry import flange_motion
 from hvs_suite.policies.network.network import STATE
 
 if TYPE_CHECKING:
@@ -167,8 +165,7 @@ def set_prior(policy: "HvsBeliefPolicy", demonstrations: Demonstrations) -> None
             f"{demonstrations.manifest.root} lacks {', '.join(missing)}, from which hvs_belief "
             "learns; record it with hvs record"
         )
-    views = network.views(flange_motion(torch.from_numpy(columns[STATE][:, :N_JOINTS]).double()))
-    network.belief.set_prior(fit_prior(columns, views, network.cell.period_s))
+    take_prior(network, columns)
 
 
 def _next_due(share: float) -> float:

@@ -11,6 +11,7 @@ from hvs_suite.policies.belief import arm
 from hvs_suite.policies.network.geometry import flange_motion
 
 UP = torch.tensor([[0.0, 0.0, 1.0]])
+NOWHERE = torch.tensor(-1.0)
 
 
 def goals(n: int, *, tilt: float) -> tuple[Tensor, Tensor]:
@@ -53,16 +54,26 @@ def test_the_tip_stays_above_where_the_goal_may_be(doubt_m: float) -> None:
     too_low = place + (least - 0.04) * normal
     q = torch.nn.functional.pad(arm.postures(too_low, normal)[:, 0], (0, 1))
     doubt = torch.full((50, 1), doubt_m)
-    kept = arm.kept_above(q, place, normal, doubt, 0.0)
+    kept = arm.kept_above(q, place, normal, doubt, NOWHERE, 0.0)
     height = ((flange_motion(kept).position - place) * normal).sum(dim=1)
     np.testing.assert_allclose(height, least, atol=4e-3)
+
+
+def test_the_tip_goes_nowhere_lower_than_the_demonstrations_did() -> None:
+    place, _ = goals(50, tilt=0.0)
+    q = torch.nn.functional.pad(arm.postures(place, UP.expand(50, 3))[:, 0], (0, 1))
+    elsewhere = place + torch.tensor([0.5, 0.5, -0.3])
+    lowest = place[:, 2].max() + 0.03
+    kept = arm.kept_above(q, elsewhere, UP.expand(50, 3), torch.zeros(50, 1), lowest, 0.0)
+    height = flange_motion(kept).position[:, 2]
+    assert (height > lowest - 0.01).all()
 
 
 def test_a_tip_that_is_high_enough_or_far_beside_is_left_alone() -> None:
     place, normal = goals(50, tilt=0.2)
     q = torch.nn.functional.pad(arm.postures(place + 0.01 * normal, normal)[:, 0], (0, 1))
     doubt = torch.zeros(50, 1)
-    assert (arm.kept_above(q, place, normal, doubt, 0.0) == q).all()
+    assert (arm.kept_above(q, place, normal, doubt, NOWHERE, 0.0) == q).all()
     side = torch.linalg.cross(normal, UP.expand(50, 3) + 0.1, dim=1)
     far = place + 0.3 * side / side.norm(dim=1, keepdim=True) + 0.1 * normal
-    assert (arm.kept_above(q, far, normal, doubt, 0.0) == q).all()
+    assert (arm.kept_above(q, far, normal, doubt, NOWHERE, 0.0) == q).all()
