@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from hvs_suite.cell import robot
 from hvs_suite.datasets.insertion import GuardedInsertion
-from hvs_suite.datasets.planner import Planner
+from hvs_suite.datasets.planner import CLEARANCE_M, Planner
 from hvs_suite.errors import OptionError
 from hvs_suite.rollout import Observation
 from hvs_suite.tasks.shared.goal import Goal
@@ -33,12 +33,15 @@ class Expert:
     Args:
         env: Where it acts.
         plain: As in `Planner`.
+        clearance_m: As in `Planner`.
 
     Raises:
         OptionError: The environment's action mode is not ``joint_position``.
     """
 
-    def __init__(self, env: Environment, *, plain: bool = False) -> None:
+    def __init__(
+        self, env: Environment, *, plain: bool = False, clearance_m: float = CLEARANCE_M
+    ) -> None:
         spec = env.spec
         if spec.action_mode != "joint_position":
             raise OptionError(
@@ -46,7 +49,12 @@ class Expert:
                 "task with action_mode='joint_position'."
             )
         self._env = env
-        self._planner = Planner(spec.control_period_s, plain=plain, embodiment=spec.embodiment)
+        self._planner = Planner(
+            spec.control_period_s,
+            plain=plain,
+            embodiment=spec.embodiment,
+            clearance_m=clearance_m,
+        )
         self._insertion = GuardedInsertion(spec.control_period_s, spec.embodiment, plain=plain)
         self._period_s = spec.control_period_s
         self._delay_s = spec.latency_steps * spec.control_period_s

@@ -142,6 +142,8 @@ class Planner:
             with every little change of where the arm stands; two can be learned
             (docs/experiments/simple-ways.md). They cost three steps.
         embodiment: The robot, whose tip is what goals are for.
+        clearance_m: What a motion keeps from surface, self and obstacles (m) where it can; where it
+            cannot, `CLEARANCE_M`.
     """
 
     def __init__(
@@ -150,11 +152,13 @@ class Planner:
         *,
         plain: bool = False,
         embodiment: Embodiment = BARE_ARM,
+        clearance_m: float = CLEARANCE_M,
     ) -> None:
         self._kinematics: Kinematics = kinematics(embodiment)
         self._period_s = period_s
         self._lead_s = LEAD_S * embodiment.slowness
         self._plain = plain
+        self._wanted_m = clearance_m
         self._n_swivel = PLAIN_SWIVELS if plain else N_SWIVEL
         self._goal_key: bytes = b""
         self._family: FloatArray = np.empty((7, 1))
@@ -204,9 +208,15 @@ class Planner:
         if len(family) == 0:
             return q
         required = min(CLEARANCE_M, self._clearance_m - 1e-3)
-        candidates = self._in_order(q, velocity, family)
         most = _MAX_PATHS_AMONG_OBSTACLES if self._solids else _MAX_PATHS
-        motion = self._first_clear(q, velocity, candidates, required, most)
+        motion = None
+        if self._wanted_m > CLEARANCE_M:
+            wanted = min(self._wanted_m, self._clearance_m - 1e-3)
+            candidates = self._in_order(q, velocity, family)
+            motion = self._first_clear(q, velocity, candidates, wanted, most)
+        if motion is None:
+            candidates = self._in_order(q, velocity, family)
+            motion = self._first_clear(q, velocity, candidates, required, most)
         if motion is None and self._solids:
             vias = self._vias(q, velocity, goal)
             motion = self._first_clear(q, velocity, vias, required, _MAX_VIAS)
@@ -436,7 +446,11 @@ class Planner:
             if any(np.abs(goal - other).max() < _DISTINCT_RAD for other in blocked):
                 continue
             motion = self._motion(q, velocity, goal)
-            if self._least_clearance(motion, required) >= required:
+            enough = required
+            if required > CLEARANCE_M:
+                # At the goal itself there may be less room.
+                enough = max(min(required, self._clearance(goal) - 1e-3), CLEARANCE_M)
+            if self._least_clearance(motion, enough) >= enough:
                 return motion
             blocked.append(goal)
             if len(blocked) >= most:
