@@ -23,7 +23,7 @@ def attach(
 
     Args:
         root: The edited dataset.
-        origins: The datasets that it was made of, which differ in noise and command at most.
+        origins: The datasets that it was made of, which may differ in noise and command alone.
         workers: Processes that share the episodes.
         progress: As in `check_dataset`.
 
@@ -31,8 +31,8 @@ def attach(
         What was written.
 
     Raises:
-        DatasetError: The origins are of different tasks, splits or options, or an episode is not
-            what they say.
+        DatasetError: The origins differ in task, split, options or demonstrator, or an episode
+            is not what they say.
         OutputError: The folder cannot be written.
     """
     reader.read_info(root)
@@ -59,7 +59,7 @@ def _joined(root: Path, origins: Sequence[tuple[Path, DatasetMetadata]]) -> Data
     for place, other in others:
         if not joined.same_recording(other.model_copy(update={"noise": joined.noise})):
             raise DatasetError(
-                f"{first} and {place} were recorded on different tasks, splits or options, and "
+                f"{first} and {place} differ in task, split, options or demonstrator, and "
                 f"{root} can be of one alone; take it apart with lerobot-edit-dataset"
             )
     # Where the noise differs, the largest allows what the others forbid.

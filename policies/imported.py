@@ -31,11 +31,14 @@ class ImportedFactory:
         module: Importable name.
         factory: Callable in it; takes a `PolicyContext`.
         place: Folder that is searched before the rest of the path: where the command was given.
+        knows_truth: Give the factory the environment itself in place of a `PolicyContext`: for
+            demonstrators, which may know what is true.
     """
 
     module: str
     factory: str
     place: str
+    knows_truth: bool = False
 
     def __call__(self, env: Any) -> Policy:
         """Imports the module, which runs its code, and builds the policy for an environment.
@@ -47,12 +50,13 @@ class ImportedFactory:
         name = f"{self.module}:{self.factory}"
         make = self._callable()
         try:
-            policy: Any = make(PolicyContext.of(env))
+            policy: Any = make(env if self.knows_truth else PolicyContext.of(env))
         except PolicyError:
             raise
         except (Exception, SystemExit) as error:  # other people's code raises anything
             raise PolicyError(
-                f"{name} cannot be built ({describe(error)}); a factory takes one PolicyContext"
+                f"{name} cannot be built ({describe(error)}); a factory takes one "
+                f"{'Environment' if self.knows_truth else 'PolicyContext'}"
             ) from error
         for method in ("reset", "select_action"):
             if not callable(getattr(policy, method, None)):
@@ -80,7 +84,7 @@ class ImportedFactory:
             raise PolicyError(f"cannot import {self.module}: there is no module of this name")
         return Path(spec.origin) if spec.has_location and spec.origin else None
 
-    def _callable(self) -> Callable[[PolicyContext], Any]:
+    def _callable(self) -> Callable[[Any], Any]:
         if self.place not in sys.path:
             sys.path.insert(0, self.place)
         try:

@@ -562,6 +562,8 @@ def load(path: Path) -> Result:
     """
     content = reading.read_object(path, error=ResultError, most=MOST_BYTES)
     version = content.get("schema_version")
+    if version is None:
+        raise ResultError(f"{path}: is no result of 'hvs evaluate' (it has no schema_version)")
     if version != SCHEMA_VERSION:
         raise ResultError(
             f"{path}: schema_version is {version!r:.50}, but this hvs_suite reads "

@@ -1,5 +1,6 @@
 """Every block of docs/your-policy.md works: programs run, files play, commands end well."""
 
+import json
 import re
 import shlex
 import shutil
@@ -57,6 +58,19 @@ def test_a_model_of_stable_baselines_is_trained_and_scored(folder):
     exec(training, {})
     [line] = commands("A model of Stable-Baselines3")
     assert run(shlex.split(line)[1:]) == 0
+
+
+def test_a_teacher_is_trained_and_demonstrates(folder, capsys):
+    training, _ = blocks("A teacher", "python")
+    exec(training, {})
+    for line in commands("A teacher"):
+        assert run(shlex.split(line)[1:]) == 0, line
+    for name, demonstrator in (("taught", "teacher:make"), ("bows", "my_policy:make")):
+        origin = json.loads((folder / "runs" / name / "hvs.json").read_text())
+        assert origin["demonstrator"] == demonstrator
+    words = ["pretrain", "--data", "runs/taught", "--steps", "2", "--out", "runs/more"]
+    assert run([*words, "--dagger-rounds", "1"]) == 2
+    assert "recorded with teacher:make" in capsys.readouterr().err
 
 
 def test_a_policy_of_lerobot_plays_the_same_from_its_folder_and_by_its_code(folder, capsys):
