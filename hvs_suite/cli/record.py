@@ -24,7 +24,7 @@ class Record(Players):
         episodes: Number of episodes to record.
         out: Root folder of the dataset; must not exist or be empty, unless --resume is given.
         split: Name of the split the scenarios come from.
-        resume: Go on with a recording that was interrupted.
+        resume: Continue a recording that was interrupted.
         start: Where the arm starts, if not where the task says; mixed starts half of the episodes
             near the goal.
         noise: Standard deviation of a disturbance of the executed joint targets, far from the goal
@@ -32,7 +32,8 @@ class Record(Players):
         policy: What demonstrates: expert, servo, a checkpoint folder, or code of your own as
             module:factory, whose factory gets the environment and may know what is true.
         option: Parameter of the task to change for a study, such as target_diameter_m=0.03; give it
-            several times for several. The dataset says so, and is not one of the named task then.
+            several times for several. The dataset then records this and does not count as one of
+            the named task.
     """
 
     task: str

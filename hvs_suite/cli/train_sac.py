@@ -13,8 +13,8 @@ class TrainSac:
     """Train a policy from scratch by soft actor-critic, with the thesis's settings.
 
     Trains for --minutes or --steps, whichever ends first, or for forty minutes if neither is given.
-    Interrupted, it goes on from its last checkpoint when the same command is given again. Curves
-    and a film of each evaluation are in OUT/training.
+    If it was interrupted, the same command continues from the last checkpoint. Curves and a film of
+    each evaluation are in OUT/training.
 
     Attributes:
         task: A named task, such as align-thesis.
