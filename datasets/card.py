@@ -1,4 +1,4 @@
-"""The dataset card: what a dataset holds and how it was made, for whoever finds it.
+"""The dataset card: what a dataset holds and how it was made.
 
 ``README.md`` with the front matter that the Hub reads, and one picture, written into the dataset.
 """
@@ -234,7 +234,7 @@ def _images(info: dict[str, Any]) -> str:
             if feature["dtype"] == "video":
                 video = feature.get("info") or {}
                 codec = str(video.get("video.codec"))
-                # Any other text is no codec's name, and has no place in a page.
+                # Any other text is not the name of a codec and is left out.
                 codec = codec if re.fullmatch(r"[a-z0-9_.-]{1,32}", codec) else "unknown"
                 how = f"video, {codec}, lossy"
             kept.append(f"{_code(key)} {width} x {height} px ({how})")
@@ -242,7 +242,7 @@ def _images(info: dict[str, Any]) -> str:
 
 
 def _code(text: str) -> str:
-    """Text of a stranger's as code in a table, which it can neither end nor leave."""
+    """Untrusted text as code in a table, with everything escaped that could end it."""
     plain = shown(text).replace("`", "'").replace("|", "\\|")
     return f"`{plain}`"
 

@@ -1,7 +1,7 @@
-"""One demonstration: the expert plays a scenario, and every frame of it is kept.
+"""One demonstration: a policy plays a scenario, and every frame of it is kept.
 
-It leaves the worker that played it ready for the disk: pictures as PNG files, their pixels counted,
-numbers by column. One process writes for all workers, so what is left to it bounds them all.
+The worker that plays it prepares it for the disk: pictures as PNG files, their pixels counted,
+numbers by column. One process writes for all workers, so its share of the work limits all of them.
 """
 
 import contextlib
@@ -36,8 +36,8 @@ NOISE_TIME_S = 0.3
 NOISE_FULL_DISTANCE_M = 0.2
 """Distance to the goal from which on the perturbation has its full size (m)."""
 NOISE_FLOOR = 0.02
-"""Share of it that is left at the goal, so that the last millimetres are demonstrated as well;
-less in proportion where the tolerance is below a millimetre, because who is shaken by more than
+"""Share of it that is left at the goal, so that the last millimetres are demonstrated as well; less
+in proportion where the tolerance is below a millimetre, because an arm that is shaken by more than
 that never arrives."""
 
 

@@ -40,7 +40,7 @@ _CLEAR_MM = 8.0
 
 
 class GuardedInsertion:
-    """Decides where the set point goes; every answer stands on what is given with it alone.
+    """Decides where the set point goes; every answer depends on its arguments alone.
 
     Args:
         period_s: Control period (s).

@@ -38,7 +38,7 @@ class DatasetMetadata(pydantic.BaseModel, frozen=True):
         options: Options of the task that differ from the named one.
         noise: Standard deviation of the perturbation of executed actions, far from the goal (rad).
         demonstrator: The policy that chose the actions, as ``hvs record --policy`` names it.
-        command: What recorded it, for people.
+        command: Command that recorded it, for readers.
         task_digest: What the task's name meant then, as ``hvs_suite.tasks.shared.lock`` says it;
             empty in datasets from before it was kept.
         format: Version of this file.

@@ -147,7 +147,7 @@ def record(
 
 @contextlib.contextmanager
 def _removed_if_empty(folders: Iterable[Path]) -> Iterator[None]:
-    """A recording that could not begin, for want of OpenGL say, leaves no trace."""
+    """Removes the folders of a recording that could not begin, such as without OpenGL."""
     try:
         yield
     finally:

@@ -1,8 +1,8 @@
 """The page of a named task, made from what the task says of itself.
 
-Nothing is written twice: the sentence, the bounds and the disturbances are the spec's, what is
-drawn is found out by drawing, what it means stands in the docstrings, and the certificate is the
-stored one. Only what makes a task hard is prose, and stands in the family's file.
+Nothing is written twice: the sentence, the bounds and the disturbances come from the spec, drawing
+scenarios shows what is random, the docstrings explain it, and the certificate is the stored one.
+Only the text on what makes a task hard is written for the page, in the family's file.
 """
 
 import dataclasses

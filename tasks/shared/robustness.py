@@ -136,7 +136,7 @@ def replaced(axes: tuple[Axis, ...], axis: Axis) -> tuple[Axis, ...]:
 
 
 def target_size(diameter_m: float) -> Axis:
-    """A target that is smaller than policies believe.
+    """A target that is smaller than policies assume.
 
     Args:
         diameter_m: Of the named task's target (m).
@@ -153,7 +153,7 @@ def target_size(diameter_m: float) -> Axis:
 
 
 def unseen_marker() -> Axis:
-    """A marker that no training showed, where a task has the choice."""
+    """A marker that did not occur in training, where a task has the choice."""
     return Axis(
         "marker",
         "unseen marker",

@@ -89,7 +89,7 @@ class Timing:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Cameras:
-    """The eye in the hand (EIH) and the eye to hand (ETH), which looks on from above.
+    """The eye in the hand (EIH) and the eye to hand (ETH), a camera above the cell.
 
     Attributes:
         eih_resolution: Side of the square eye-in-hand image (px).
@@ -139,8 +139,9 @@ class Disturbances:
             640 px wide), which then have steps and holes as well; 0 for true depth.
         n_strewn: Things that lie around and are not the target: discs of other colours, red squares
             and half discs, as large as it is.
-        unannounced: The other options come as a surprise: the scenes are the named task's but for
-            what the options change in them, and policies are told the named task's parameters.
+        unannounced: Policies are not told of the other options: they get the named task's
+            parameters, and the scenes are the named task's except for what the options change in
+            them.
     """
 
     vary_light: bool = scene(False)
