@@ -115,7 +115,7 @@ def checkpoint_folder(spec: str, task: str) -> Path:
 
 
 def name_of(folder: Path) -> str:
-    """A checkpoint's folder as notes have it: shipped weights lie elsewhere on each machine.
+    """A checkpoint's folder as notes name it: shipped weights without this machine's path.
 
     Args:
         folder: As `checkpoint_folder` gives it.

@@ -1,10 +1,10 @@
-"""Plays a person's own code: ``module:factory``, anything with ``reset`` and ``select_action``.
+"""Plays code of one's own: ``module:factory``, anything with ``reset`` and ``select_action``.
 
 How to write such a module: docs/your-policy.md.
 
-Importing the module runs its code with all the rights of whoever evaluates it. Nothing in the suite
-does so unless that name was typed on the command line or passed to `policy_factory`; a score is
-played in a process apart (see `hvs_suite.eval.serving.policy_process`).
+Importing the module runs its code with all the rights of the user. The suite does so only if that
+name was typed on the command line or passed to `policy_factory`; a score is played in a separate
+process (see `hvs_suite.eval.serving.policy_process`).
 """
 
 import dataclasses
@@ -53,7 +53,7 @@ class ImportedFactory:
             policy: Any = make(env if self.knows_truth else PolicyContext.of(env))
         except PolicyError:
             raise
-        except (Exception, SystemExit) as error:  # other people's code raises anything
+        except (Exception, SystemExit) as error:  # foreign code may raise anything
             raise PolicyError(
                 f"{name} cannot be built ({describe(error)}); a factory takes one "
                 f"{'Environment' if self.knows_truth else 'PolicyContext'}"
@@ -89,7 +89,7 @@ class ImportedFactory:
             sys.path.insert(0, self.place)
         try:
             module = importlib.import_module(self.module)
-        except (Exception, SystemExit) as error:  # somebody else's module raises anything
+        except (Exception, SystemExit) as error:  # a foreign module may raise anything
             raise PolicyError(f"cannot import {self.module}: {describe(error)}") from error
         found = getattr(module, self.factory, None)
         if not callable(found):

@@ -131,7 +131,7 @@ def read_manifest(root: Path) -> Manifest:
         raise DatasetError(f"{root}: hvs.json: {error}") from error
     for key in manifest.trained_keys:
         found = list(manifest.features[key]["shape"])
-        # Pictures may be smaller than the task's; their size is held against the files.
+        # Pictures may be smaller than the task's; their size is checked in the files.
         if key.startswith(IMAGE_PREFIX):
             continue
         right = list(wanted[key]["shape"]) if key in wanted else "recorded on this task"
