@@ -89,8 +89,8 @@ def read_metadata(root: str | Path) -> DatasetMetadata:
     path = Path(root) / METADATA_FILE
     if not os.path.lexists(path):
         raise DatasetError(
-            f"{root} holds no {METADATA_FILE}: name the root of a dataset made by 'hvs record'; to "
-            f"one that LeRobot's tools made of such, 'hvs attach {root} --origin DIR' gives it back"
+            f"{root} holds no {METADATA_FILE}: name the root of a dataset made by 'hvs record'; "
+            f"for one that LeRobot's tools edited, 'hvs attach {root} --origin DIR' restores it"
         )
     content = read_object(path, error=DatasetError, within=Path(root), most=_MOST_BYTES)
     if content.get("format") != FORMAT:

@@ -98,6 +98,6 @@ def check_public(policy: str) -> None:
     """
     if policy in PRIVILEGED:
         raise PolicyError(
-            f"{policy} looks behind the observations, which do not travel; evaluate it without a "
-            "server"
+            f"{policy} needs more than the observations, which are all that a server gets; "
+            "evaluate it without one"
         )

@@ -179,7 +179,7 @@ def verify(
     if n_near > most:
         raise ResultError(
             f"{path}: rounding would have decided {n_near} of {len(chosen)} outcomes as the file "
-            f"says; more than {most} is no chance"
+            f"says; more than {most} cannot be chance"
         )
     return Verdict(len(rows), len(chosen), n_near, nonce, largest)
 

@@ -398,7 +398,7 @@ def _describe(spec: Any) -> dict[str, Any]:
 
 
 def _words(said: object) -> str:
-    """A line of what the other end said, or of an error; not more than anybody would read."""
+    """A line of what the other end said, or of an error, shortened for a reader."""
     return " ".join(str(said).split())[:_LONGEST_WORDS] or type(said).__name__
 
 

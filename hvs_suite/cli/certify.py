@@ -52,7 +52,7 @@ class Certify:
             raise OptionError(f"--workers must be at least 1, not {self.workers}")
         asked = self.tasks or filter(lock.is_own, hvs_suite.TASKS)
         options = {task: find(task).options_from_text(self.option) for task in asked}
-        # All are held against the lock first: certifying takes minutes a task.
+        # All are compared with the lock first, because certifying takes minutes a task.
         entries: dict[str, lock.LockEntry | None] = {}
         for task in options:
             entries[task] = None

@@ -79,7 +79,7 @@ def watch(env: "Environment", policy: Policy, scenario: int) -> PlayedEpisode:
 
     Args:
         env: The task.
-        policy: Who plays.
+        policy: The policy that plays.
         scenario: Index in the split.
 
     Returns:
@@ -93,7 +93,7 @@ def correct(env: "Environment", policy: Policy, scenario: int) -> PlayedEpisode:
 
     Args:
         env: The task.
-        policy: Who plays.
+        policy: The policy that plays.
         scenario: Index in the split.
 
     Returns:

@@ -114,7 +114,7 @@ def common_axes(spec: "Spec") -> tuple[Axis, ...]:
             "joint-offset",
             "joint offsets",
             "what align-drill has, twice and four times that: 0.1 deg in one joint moves the tip "
-            "by 1.4 mm at a reach of 0.8 m, as in an arm that nobody calibrated",
+            "by 1.4 mm at a reach of 0.8 m, as in an arm that was not calibrated",
             "joint_offset_deg",
             (0.05, 0.1, 0.2),
             "{:g}°",

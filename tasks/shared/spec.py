@@ -296,7 +296,7 @@ class Spec(Timing, Cameras, Disturbances):
             raise OptionError(f"discount is {self.discount}; use 0 to 1")
 
     def _check(self, rule: str, holds: typing.Callable[[float], bool], *names: str) -> None:
-        """Hold fields against a rule.
+        """Check fields by a rule.
 
         Args:
             rule: In words, after "it ".
@@ -318,7 +318,7 @@ class Spec(Timing, Cameras, Disturbances):
         self._check("cannot be negative", lambda value: value >= 0, *names)
 
     def _check_range(self, *names: str, least: float = 0.0, most: float = math.inf) -> None:
-        """Hold fields that are a least and a largest value against bounds.
+        """Check fields that are a least and a largest value against bounds.
 
         Raises:
             OptionError: A field breaks them.
