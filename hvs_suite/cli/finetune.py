@@ -26,7 +26,7 @@ class Finetune:
         out: Folder for the checkpoint.
         minutes: Stop after this much playing and learning, evaluations and eyes not counted (min).
         steps: Stop after this many environment steps.
-        seed: Of weights, scenes, exploration and batches.
+        seed: Seed of weights, scenes, exploration and batches.
         curriculum: Learn with wider tolerances first, or with starts nearer to the goal.
         eye_rounds: How often to let the policy play before RL, and to train its eyes on what it
             saw.

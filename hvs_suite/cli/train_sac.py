@@ -21,7 +21,7 @@ class TrainSac:
         out: Folder for the policy, which hvs evaluate --policy takes.
         minutes: Stop after this much playing and learning, evaluations not counted (min).
         steps: Stop after this many environment steps.
-        seed: Of weights, scenes, exploration and batches.
+        seed: Seed of weights, scenes, exploration and batches.
         eval_every: Environment steps between evaluations; one more comes at start and end.
         eval_episodes: Episodes an evaluation, on scenes of a split of their own.
         reward: Reward term to learn from; give it several times for several terms. Without it, the
