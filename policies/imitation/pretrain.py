@@ -159,6 +159,7 @@ def pretrain(
             PACKAGES,
             data=str(data),
             options=dict(manifest.options),
+            demonstrator=manifest.demonstrator,
             policy={
                 "type": policy.config.type,
                 "channels": policy.config.channels,

@@ -68,6 +68,8 @@ def test_a_teacher_is_trained_and_demonstrates(folder, capsys):
     for name, demonstrator in (("taught", "teacher:make"), ("bows", "my_policy:make")):
         origin = json.loads((folder / "runs" / name / "hvs.json").read_text())
         assert origin["demonstrator"] == demonstrator
+    notes = json.loads((folder / "runs/pupil/train_config.json").read_text())
+    assert notes["demonstrator"] == "teacher:make"
     words = ["pretrain", "--data", "runs/taught", "--steps", "2", "--out", "runs/more"]
     assert run([*words, "--dagger-rounds", "1"]) == 2
     assert "recorded with teacher:make" in capsys.readouterr().err
