@@ -34,7 +34,7 @@ def write(path: Path) -> None:
                 ":link-type: doc",
                 f":img-top: {_film(spec.name, path.parent)}",
                 "",
-                f"{words.target}: {words.tolerance}{held}",
+                f"Target: {words.target}. Tolerance: {words.tolerance}{held}.",
                 ":::",
                 "",
             ]

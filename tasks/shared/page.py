@@ -49,10 +49,23 @@ def page(env: "Environment", certificate: Certificate, picture: str) -> str:
             "",
             f"![Start and goal of a scenario of {spec.name}, and its certificate]({picture})",
             "",
-            f"The arm starts: {words.start}. Target: {words.target}. Success: {words.tolerance}"
-            f"{held}. Time: {spec.time_limit_steps} control steps of "
-            f"{spec.control_period_s:g} s ({seconds:g} s). Disturbed: "
-            f"{'nothing' if words.disturbances == '-' else words.disturbances}.",
+            *_table(
+                ("", ""),
+                (
+                    ("start", words.start),
+                    ("target", words.target),
+                    ("success", f"{words.tolerance}{held}"),
+                    (
+                        "time",
+                        f"{spec.time_limit_steps} control steps of {spec.control_period_s:g} s "
+                        f"({seconds:g} s)",
+                    ),
+                    (
+                        "disturbances",
+                        "none" if words.disturbances == "-" else words.disturbances,
+                    ),
+                ),
+            ),
             "",
             "## What is hard about it",
             "",
