@@ -15,7 +15,7 @@ from hvs_suite.cli.main import run
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "your-policy.md").read_text("utf-8")
 SECTIONS = dict(re.findall(r"^## ([^\n]*)\n(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL))
-pytestmark = pytest.mark.timeout(300)
+pytestmark = pytest.mark.timeout(600)
 
 
 @pytest.fixture
