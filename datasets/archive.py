@@ -1,8 +1,8 @@
 """Datasets as one file: a plain tar that names the checksum of everything in it.
 
-The same dataset gives the same bytes: members are sorted and carry neither times nor owners. What
-comes back is trusted no further than its checksums: only plain files below the target, all of them
-listed, none twice, and together no larger than a packed dataset unpacks to.
+The same dataset gives the same bytes: members are sorted and carry neither times nor owners. An
+archive is not trusted: it may hold only plain files below the target, all of them listed with
+checksums, none twice, and together no larger than a packed dataset unpacks to.
 """
 
 import gzip
@@ -29,7 +29,7 @@ from hvs_suite.reading import check_regular
 CHECKSUMS = "SHA256SUMS"
 SUFFIXES = (".tar", ".tar.gz", ".tgz")
 _MAX_CHECKSUMS_BYTES = 8 * 2**20
-# Pictures and parquet are compressed already: gzip makes next to nothing of them.
+# Pictures and parquet are already compressed, so gzip gains almost nothing.
 _MOST_EXPANSION = 20
 _ALWAYS_ALLOWED_BYTES = 64 * 2**20
 _GZIP_MAGIC = b"\x1f\x8b"

@@ -1,4 +1,4 @@
-"""An edited dataset gets its origin back, which LeRobot's tools leave behind, once it is proven."""
+"""Restores the origin of a dataset that LeRobot's tools edited, after checking it."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,14 +16,15 @@ def attach(
     workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> DatasetMetadata:
-    """Writes ``hvs.json`` into a dataset that was made of others, if it is what they say.
+    """Writes ``hvs.json`` into a dataset that was made of others, if its episodes agree with it.
 
-    All episodes are played again, without pictures: they are of the origins' task, split and
-    options, or this ends with an error and writes nothing.
+    LeRobot's tools copy neither this file nor unknown entries of ``info.json``. All episodes are
+    played again, without pictures. If one does not fit the origins' task, split and options, this
+    raises an error and writes nothing.
 
     Args:
         root: The edited dataset.
-        origins: The datasets that it was made of, which differ in noise and command at most.
+        origins: The datasets that it was made of, which may differ in noise and command alone.
         workers: Processes that share the episodes.
         progress: As in `check_dataset`.
 
@@ -31,8 +32,8 @@ def attach(
         What was written.
 
     Raises:
-        DatasetError: The origins are of different tasks, splits or options, or an episode is not
-            what they say.
+        DatasetError: The origins differ in task, split, options or demonstrator, or an episode
+            is not what they say.
         OutputError: The folder cannot be written.
     """
     reader.read_info(root)
@@ -53,16 +54,16 @@ def _joined(root: Path, origins: Sequence[tuple[Path, DatasetMetadata]]) -> Data
     """The one origin of several recordings.
 
     Raises:
-        DatasetError: They are no recordings of the same.
+        DatasetError: They are not recordings of the same task in the same way.
     """
     (first, joined), *others = origins
     for place, other in others:
         if not joined.same_recording(other.model_copy(update={"noise": joined.noise})):
             raise DatasetError(
-                f"{first} and {place} were recorded on different tasks, splits or options, and "
+                f"{first} and {place} differ in task, split, options or demonstrator, and "
                 f"{root} can be of one alone; take it apart with lerobot-edit-dataset"
             )
-    # Where the noise differs, the largest allows what the others forbid.
+    # Where the noise differs, the largest one fits all episodes.
     return joined.model_copy(
         update={
             "noise": max(metadata.noise for _, metadata in origins),

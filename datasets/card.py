@@ -1,4 +1,4 @@
-"""The dataset card: what a dataset holds and how it was made, for whoever finds it.
+"""The dataset card: what a dataset holds and how it was made.
 
 ``README.md`` with the front matter that the Hub reads, and one picture, written into the dataset.
 """
@@ -13,7 +13,7 @@ import numpy as np
 from hvs_suite.cell.robot import JOINT_NAMES
 from hvs_suite.datasets import reader
 from hvs_suite.datasets.features import SCENARIO, image_key
-from hvs_suite.datasets.metadata import DatasetMetadata, read_metadata
+from hvs_suite.datasets.metadata import EXPERT, DatasetMetadata, read_metadata
 from hvs_suite.files import replacing
 from hvs_suite.names import shown
 from hvs_suite.registry import find
@@ -121,7 +121,7 @@ def describe(
     options = ", ".join(_code(f"{k}={v!r}") for k, v in sorted(metadata.options.items()))
     noise = (
         f"temporally correlated, {metadata.noise:g} rad far from the goal, on what is executed "
-        f"(`privileged.action_executed`); `action` is the expert's own"
+        f"(`privileged.action_executed`); `action` is the demonstrator's own"
         if metadata.noise
         else "none: `action` is what was executed"
     )
@@ -138,7 +138,9 @@ def describe(
         f"{contents.mean_steps:.1f} an episode",
         "success": f"{contents.successes:,} of {contents.episodes:,} ({share:.1f} %)",
         "demonstrator": "the suite's scripted expert: time-optimal motion within the limits of "
-        "joint speed and acceleration, replanned every step from the true state",
+        "joint speed and acceleration, replanned every step from the true state"
+        if metadata.demonstrator == EXPERT
+        else _code(metadata.demonstrator),
         "noise": noise,
         "images": _images(info),
         "size": f"{contents.size_mb:.1f} MB",
@@ -232,7 +234,7 @@ def _images(info: dict[str, Any]) -> str:
             if feature["dtype"] == "video":
                 video = feature.get("info") or {}
                 codec = str(video.get("video.codec"))
-                # Any other text is no codec's name, and has no place in a page.
+                # Any other text is not the name of a codec and is left out.
                 codec = codec if re.fullmatch(r"[a-z0-9_.-]{1,32}", codec) else "unknown"
                 how = f"video, {codec}, lossy"
             kept.append(f"{_code(key)} {width} x {height} px ({how})")
@@ -240,7 +242,7 @@ def _images(info: dict[str, Any]) -> str:
 
 
 def _code(text: str) -> str:
-    """Text of a stranger's as code in a table, which it can neither end nor leave."""
+    """Untrusted text as code in a table, with everything escaped that could end it."""
     plain = shown(text).replace("`", "'").replace("|", "\\|")
     return f"`{plain}`"
 

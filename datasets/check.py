@@ -1,6 +1,6 @@
-"""Checking a dataset: is every frame there, whole, and what the simulation says it must be?
+"""Checking a dataset: is every frame there, intact, and equal to what the simulation gives?
 
-Damage is collected, not raised: each place is named by file, episode and frame. Episodes are
+Damage is collected, not raised; each place is given by file, episode and frame. Episodes are
 independent, so several processes share them.
 """
 
@@ -101,7 +101,7 @@ def check_dataset(
 
     Args:
         root: The dataset.
-        metadata: Origin to hold it against; the dataset's own by default.
+        metadata: Origin to compare it with; the dataset's own by default.
         workers: Processes that share the episodes, or others elsewhere that see the same folder.
         pictures: Also draw every frame again and compare; decoding is checked in any case.
         progress: Called after each episode with the number checked and of all.

@@ -1,7 +1,7 @@
-"""One demonstration: the expert plays a scenario, and every frame of it is kept.
+"""One demonstration: a policy plays a scenario, and every frame of it is kept.
 
-It leaves the worker that played it ready for the disk: pictures as PNG files, their pixels counted,
-numbers by column. One process writes for all workers, so what is left to it bounds them all.
+The worker that plays it prepares it for the disk: pictures as PNG files, their pixels counted,
+numbers by column. One process writes for all workers, so its share of the work limits all of them.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ from hvs_suite.datasets.features import (
 )
 from hvs_suite.datasets.png import encode
 from hvs_suite.registry import load
-from hvs_suite.rollout import Policy
+from hvs_suite.rollout import Policy, tell
 
 if TYPE_CHECKING:
     from hvs_suite.tasks.shared.environment import Environment, Moment
@@ -36,8 +36,8 @@ NOISE_TIME_S = 0.3
 NOISE_FULL_DISTANCE_M = 0.2
 """Distance to the goal from which on the perturbation has its full size (m)."""
 NOISE_FLOOR = 0.02
-"""Share of it that is left at the goal, so that the last millimetres are demonstrated as well;
-less in proportion where the tolerance is below a millimetre, because who is shaken by more than
+"""Share of it that is left at the goal, so that the last millimetres are demonstrated as well; less
+in proportion where the tolerance is below a millimetre, because an arm that is shaken by more than
 that never arrives."""
 
 
@@ -96,28 +96,34 @@ class MakeEnvironment:
 
 @dataclasses.dataclass(frozen=True)
 class Demonstrate:
-    """Plays scenarios with the expert; for :func:`hvs_suite.rollout.play`.
+    """Plays scenarios with a demonstrator; for :func:`hvs_suite.rollout.play`.
 
     Attributes:
         noise: Standard deviation of the perturbation of the executed joint targets, far from the
-            goal (rad); 0 executes what the expert says.
+            goal (rad); 0 executes what the demonstrator says.
+        looks: Whether the demonstrator needs the pictures to decide.
     """
 
     noise: float
+    looks: bool = False
 
-    def __call__(self, env: "Environment", expert: Policy, scenario: int) -> Demonstration:
+    def __call__(self, env: "Environment", policy: Policy, scenario: int) -> Demonstration:
         """Plays one scenario to its end."""
-        # The expert does not look, so the pictures can wait.
-        env.draws = False
+        # The expert does not look, and drawing all pictures of an episode at once is faster.
+        env.draws = self.looks
         time_step = env.reset(scenario=scenario)
-        expert.reset()
+        tell(policy, env)
+        policy.reset()
         perturbation = _Perturbation(env, scenario, self.noise) if self.noise > 0.0 else None
         frames: list[Frame] = []
         moments: list[Moment] = []
         while not time_step.last():
             frame = observed_part(env.spec, time_step.observation, env)
             moments.append(env.moment())
-            action = expert.select_action(time_step.observation)
+            action = policy.select_action(time_step.observation)
+            if self.looks:
+                # The expert keeps within the bounds by itself.
+                action = np.clip(action, -1.0, 1.0).astype(np.float32)
             executed = action if perturbation is None else perturbation.apply(action)
             time_step = env.step(executed)
             frame |= acted_part(
@@ -128,9 +134,10 @@ class Demonstrate:
                 env.info["is_success"],
             )
             frames.append(frame)
-        for camera, drawn in env.pictures(moments).items():
-            for frame, picture in zip(frames, drawn, strict=True):
-                frame[image_key(camera)] = picture
+        if not self.looks:
+            for camera, drawn in env.pictures(moments).items():
+                for frame, picture in zip(frames, drawn, strict=True):
+                    frame[image_key(camera)] = picture
         features = dataset_features(env.spec)
         return packed(scenario, frames, features, env.info, env.instruction)
 

@@ -1,8 +1,8 @@
-"""The scripted expert: it knows what is true, and plans every control step from it alone.
+"""The scripted expert: it knows the true state, and plans every control step from it alone.
 
 It predicts the joints to the moment from which the action acts (tasks with latency) and commands
-what the planner answers. It keeps no memory, so it answers the same for any policy that brought the
-arm to a state: what DAgger needs.
+what the planner answers. It keeps no memory, so its action in a state does not depend on how the
+arm got there, as DAgger needs.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Expert:
         self._delay_s = spec.latency_steps * spec.control_period_s
 
     def reset(self) -> None:
-        """Nothing to forget: every decision stands on the present state alone."""
+        """Nothing to forget: every decision depends on the present state alone."""
 
     def select_action(self, observation: Observation) -> npt.NDArray[np.float32]:
         """The expert's action (7,) in [-1, 1] for the environment's present state."""

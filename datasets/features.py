@@ -30,7 +30,7 @@ from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared.spec import Spec
 
 ROBOT_TYPE = "kuka_lbr_iiwa"
-# Spelled out rather than imported: robot.py loads MuJoCo, and reading a dataset must not.
+# Written out instead of imported, because robot.py loads MuJoCo, which reading a dataset must not.
 JOINT_NAMES = ("A1", "A2", "A3", "A4", "A5", "A6", "A7")
 CAMERAS = ("eih", "eth")
 
@@ -139,7 +139,7 @@ def acted_part(
     """The columns that are known after the control step.
 
     Args:
-        action: The expert's action (7,).
+        action: The demonstrator's action (7,).
         executed: The action done (7,).
         reward: Reward of the step.
         done: The step ended the episode.

@@ -48,7 +48,7 @@ SETTLED_SHARE = 1.0 / 3.0
 
 
 class GuardedInsertion:
-    """Decides where the set point goes; every answer stands on what is given with it alone.
+    """Decides where the set point goes; every answer depends on its arguments alone.
 
     Args:
         period_s: Control period (s).

@@ -2,7 +2,7 @@
 
 Written with PyArrow and JSON alone: LeRobot's own writer goes through temporary PNG files and
 Hugging Face's ``datasets`` and takes 20 ms a frame, more than simulating it, and importing it takes
-10 to 20 s. The layout is small and versioned; a test holds these files against LeRobot's own.
+10 to 20 s. The layout is small and versioned; a test compares these files with LeRobot's own.
 """
 
 import json
@@ -108,7 +108,7 @@ def data_schema(features: Mapping[str, dict[str, Any]]) -> pa.Schema:
 def data_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
     """Opens a data file; one row group an episode, as LeRobot has it."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Extremes and dictionaries of PNG bytes would only fatten the file's footer.
+    # Extremes and dictionaries of PNG bytes would only enlarge the file's footer.
     plain = [field.name for field in schema if not pa.types.is_nested(field.type)]
     return pq.ParquetWriter(
         path, schema, compression="snappy", use_dictionary=plain, write_statistics=plain

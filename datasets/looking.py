@@ -1,17 +1,17 @@
 """The demonstrator: the expert, except that it looks for the target before it goes there.
 
-The expert knows where the target is. A policy that learns from it does not, where the arm hides the
-target from both cameras, and the mean of all ways to all places that it might be at leads nowhere.
-So as long as no camera has seen the target, the demonstrator moves the arm out of the eye-to-hand
-camera's line of sight, to the same posture whatever it knows. Where an obstacle hides the target
-even then, the hand looks down all around the base.
+The expert knows where the target is. If the arm hides the target from both cameras, a policy that
+learns from the expert does not know it, and the mean of the ways to all possible places leads
+nowhere. So as long as no camera has seen the target, the demonstrator moves the arm out of the
+eye-to-hand camera's line of sight, always to the same posture. If an obstacle hides the target even
+then, the eye in hand looks down all around the base.
 
-Where the eye-to-hand camera stands a little elsewhere than it should, it says only within some
-centimetres where the target is. Who goes there at once ends up beside it, too low for the eye in
-the hand to see it. So until the eye in the hand has seen the target, the demonstrator heads for a
-place above it, from which it will; above a target that moves, it moves along.
+If the pose of the eye-to-hand camera is not exact, it locates the target only within some
+centimetres. An arm that goes there at once ends up beside the target, too low for the eye in hand
+to see it. So until the eye in hand has seen the target, the demonstrator heads for a place above
+it, from which the eye in hand can see it. Above a target that moves, it moves along.
 
-A target that is suddenly elsewhere is a new one, of which nothing has been seen.
+A target that is suddenly elsewhere counts as a new one that has not been seen.
 
 And where the arm may start anywhere, it goes there in one of two plain postures (see
 `hvs_suite.datasets.planner.Planner`).

@@ -15,6 +15,8 @@ from hvs_suite.reading import read_object, validated
 
 METADATA_FILE = "hvs.json"
 FORMAT: Final = 1
+EXPERT: Final = "expert"
+_ADDED_LATER = frozenset({"task_digest", "demonstrator"})
 _MOST_BYTES = 2**20
 
 
@@ -35,7 +37,8 @@ class DatasetMetadata(pydantic.BaseModel, frozen=True):
         split: Stream that the scenarios come from.
         options: Options of the task that differ from the named one.
         noise: Standard deviation of the perturbation of executed actions, far from the goal (rad).
-        command: What recorded it, for people.
+        demonstrator: The policy that chose the actions, as ``hvs record --policy`` names it.
+        command: Command that recorded it, for readers.
         task_digest: What the task's name meant then, as ``hvs_suite.tasks.shared.lock`` says it;
             empty in datasets from before it was kept.
         format: Version of this file.
@@ -46,6 +49,7 @@ class DatasetMetadata(pydantic.BaseModel, frozen=True):
     split: _Name
     options: Mapping[str, Any] = {}
     noise: Annotated[float, pydantic.Field(ge=0.0, allow_inf_nan=False)] = 0.0
+    demonstrator: _Name = EXPERT
     command: Annotated[str, pydantic.StringConstraints(strict=True, max_length=100_000)] = ""
     task_digest: Annotated[str, pydantic.StringConstraints(pattern="^([0-9a-f]{64})?$")] = ""
     format: Literal[1] = FORMAT
@@ -85,13 +89,13 @@ def read_metadata(root: str | Path) -> DatasetMetadata:
     path = Path(root) / METADATA_FILE
     if not os.path.lexists(path):
         raise DatasetError(
-            f"{root} holds no {METADATA_FILE}: name the root of a dataset made by 'hvs record'; to "
-            f"one that LeRobot's tools made of such, 'hvs attach {root} --origin DIR' gives it back"
+            f"{root} holds no {METADATA_FILE}: name the root of a dataset made by 'hvs record'; "
+            f"for one that LeRobot's tools edited, 'hvs attach {root} --origin DIR' restores it"
         )
     content = read_object(path, error=DatasetError, within=Path(root), most=_MOST_BYTES)
     if content.get("format") != FORMAT:
         raise DatasetError(f"{path} has another format than {FORMAT}; update hvs-suite")
-    for name in sorted(set(DatasetMetadata.model_fields) - {"task_digest"}):
+    for name in sorted(set(DatasetMetadata.model_fields) - _ADDED_LATER):
         if name not in content:
             raise DatasetError(f"{path} lacks {name!r}; record the dataset again")
     return validated(DatasetMetadata, content, path, error=DatasetError)

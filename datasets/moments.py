@@ -34,7 +34,7 @@ class Moments:
         high: Greatest values (k,).
         mean: Means (k,).
         variance: Variances (k,), population.
-        rounding: Relative error that the sums of whoever lists such statistics may have.
+        rounding: Relative error that the sums of the listed statistics may have.
     """
 
     count: int

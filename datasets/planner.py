@@ -1,8 +1,8 @@
 """The planner: the fastest way to a goal from wherever the arm is, every control step.
 
-It keeps no memory of its own plan, and therefore answers the same for any policy that brought the
-arm to a state: what DAgger needs. The expert plans with what is true, the classical baseline with
-what it believes.
+It keeps no memory of its own plan, so its answer in a state does not depend on how the arm got
+there, as DAgger needs. The expert plans with the true state, the classical baseline with its
+estimate.
 
 A decision is:
 
@@ -69,7 +69,7 @@ _MAX_ESCAPES = 4
 _MAX_FLANGE_SPEED_M_S = 2.5
 _PATH_STEP_S = 0.02
 _DISTINCT_RAD = 0.2
-# Ruckig fails on some targets that braking reaches exactly; one beside them will do.
+# Ruckig fails on some targets that braking reaches exactly; a target beside them works.
 _NUDGES_RAD = (0.0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3)
 _LEVEL = 1.0 - 1e-12
 _MEETINGS = 3
@@ -132,15 +132,16 @@ def _stopping_travel_time(
 
 
 class Planner:
-    """Plans for one arm; every answer stands on what is given with it alone.
+    """Plans for one arm; every answer depends on its arguments alone.
 
     Args:
         period_s: Control period (s).
         plain: Go to the goal in one of two postures, the elbow straight above the line from
             shoulder to wrist, A1 towards the target or away from it: the one whose slowest joint
-            arrives first at full speed. Which of some two thousand postures is the soonest jumps
-            with every little change of where the arm stands; two can be learned
-            (docs/experiments/simple-ways.md). They cost three steps.
+            arrives first at full speed. Which of some two thousand postures is reached soonest
+            changes with every small change of the arm's position, and a network cannot learn that;
+            it can learn the choice between two (docs/experiments/simple-ways.md). They cost three
+            steps.
         embodiment: The robot, whose tip is what goals are for.
         clearance_m: What a motion keeps from surface, self and obstacles (m) where it can; where it
             cannot, `CLEARANCE_M`.

@@ -1,7 +1,7 @@
 """Datasets on the Hugging Face Hub, and their conversion to video, both through LeRobot.
 
 LeRobot finds the access token itself (``HF_TOKEN`` or an earlier login); it never passes through
-our code, and is cut from whatever an error says.
+our code, and is removed from error messages.
 """
 
 import contextlib
@@ -152,7 +152,7 @@ def convert_to_video(root: Path, out: Path, encoding: Encoding) -> None:
     from lerobot.configs.video import RGBEncoderConfig
     from lerobot.datasets.dataset_tools import convert_image_to_video_dataset
 
-    # SVT-AV1 greets each video with twenty lines, past Python's own streams; errors remain.
+    # SVT-AV1 prints twenty lines for each video, past Python's own streams; errors remain.
     os.environ.setdefault("SVT_LOG", "1")
     with _quiet(), _own_schedule():
         convert_image_to_video_dataset(

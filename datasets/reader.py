@@ -3,8 +3,8 @@
 LeRobot's dataset package takes some 20 s to import and reads a frame at a time; checking, filming
 and sharing need whole episodes. Frames are images in parquet, or videos after a conversion.
 
-Nothing of a dataset is believed: only ordinary files inside its folder are read, of bounded size
-(``hvs_suite.reading``), and what they hold has to have the types that it should have.
+A dataset is not trusted: only ordinary files inside its folder are read, of bounded size
+(``hvs_suite.reading``), and their contents must have the right types.
 """
 
 import contextlib
@@ -431,7 +431,8 @@ def _cached_table(root: Path, name: str) -> pa.Table:
     """A whole file: it holds many episodes, which are read one after the other."""
     with in_file(root, name) as path:
         check_regular(path, error=DatasetError, within=root)
-        # The time of the last change is part of the key: a dataset may be mended and read again.
+        # The time of the last change is part of the key, because a dataset may be repaired and read
+        # again.
         return _cached_table_as_of(root, name, path.stat().st_mtime_ns)
 
 

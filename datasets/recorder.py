@@ -1,4 +1,4 @@
-"""Recording: the expert's demonstrations of a task as one LeRobot dataset.
+"""Recording: demonstrations of a task as one LeRobot dataset.
 
 Workers play scenarios, render and encode; this process alone writes. Episode i of the
 dataset is scenario i of the split, whatever the number of workers and however often the recording
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from hvs_suite.datasets.features import dataset_features
 from hvs_suite.datasets.metadata import (
+    EXPERT,
     METADATA_FILE,
     DatasetMetadata,
     read_metadata,
@@ -24,7 +25,7 @@ from hvs_suite.errors import DatasetError, HvsError, OptionError, OutputError, S
 from hvs_suite.executor import Workers, check_workers
 from hvs_suite.names import check_name
 from hvs_suite.registry import find, options_of
-from hvs_suite.rollout import play
+from hvs_suite.rollout import PolicyFactory, play
 from hvs_suite.tasks.shared.lock import digest
 from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
 
@@ -65,6 +66,8 @@ def record(
     *,
     workers: Workers = 1,
     noise: float = 0.0,
+    demonstrator: str = EXPERT,
+    make: PolicyFactory | None = None,
     resume: bool = False,
     progress: Callable[[Progress], None] | None = None,
     command: str = "",
@@ -80,7 +83,9 @@ def record(
         options: Options of the task, start distributions among them.
         workers: Processes that play, 1 being this one; or others elsewhere.
         noise: Standard deviation of the temporally correlated perturbation of the executed joint
-            targets, far from the goal (rad). The expert's own action stays the label.
+            targets, far from the goal (rad). The demonstrator's own action stays the label.
+        demonstrator: Name of the policy that demonstrates, for ``hvs.json``.
+        make: Builds that policy for an environment; None builds the expert.
         resume: Go on after the last published episode.
         progress: Called after each episode.
         command: What to write into ``hvs.json`` as the command that made the dataset.
@@ -107,6 +112,7 @@ def record(
         split=split,
         options=options_of(spec),
         noise=float(noise),
+        demonstrator=demonstrator,
         command=command,
         task_digest=digest(task),
     )
@@ -124,9 +130,9 @@ def record(
         writer = DatasetWriter(root, features, spec.fps, block)
         played = play(
             MakeEnvironment(task, split, metadata.options),
-            make_demonstrator,
+            make or make_demonstrator,
             range(len(outcomes), episodes),
-            Demonstrate(noise),
+            Demonstrate(noise, looks=make is not None),
             workers=workers,
         )
         with _publishing(writer, root, episodes), contextlib.closing(played):
@@ -141,7 +147,7 @@ def record(
 
 @contextlib.contextmanager
 def _removed_if_empty(folders: Iterable[Path]) -> Iterator[None]:
-    """A recording that could not begin, for want of OpenGL say, leaves no trace."""
+    """Removes the folders of a recording that could not begin, such as without OpenGL."""
     try:
         yield
     finally:

@@ -2,11 +2,11 @@
 
 Some hundred postures, the same for every scene, and those at a goal are joined by straight joint
 motions. What a scene's obstacles leave of them gives each posture a time to go to the goal. So the
-answer to "where next?" depends on the scene, the goal and where the arm is, and on nothing that
-went before: who asks again in every control step is led along one way, and a learner that strayed
-is led back from wherever it is. (A probabilistic roadmap, Kavraki et al. 1996, with edges tried
-only when a way uses them, Bohlin and Kavraki 2000; its samples are a Halton sequence, so they are
-no more random than a grid.)
+next via point depends only on the scene, the goal and where the arm is, not on what happened
+before. Asked again in every control step, the roadmap leads along one way, and it also leads a
+learner back that has left it. (A probabilistic roadmap, Kavraki et al. 1996, with edges tried only
+when a way uses them, Bohlin and Kavraki 2000; its samples are a Halton sequence, so they are no
+more random than a grid.)
 
 The last joint turns the flange about its own axis, which meets nothing: it is left out.
 """

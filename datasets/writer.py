@@ -109,7 +109,7 @@ class DatasetWriter:
         self._block = block
         self._published: _Published | None = None
         self._open: _Block | None = None
-        # PyArrow loads pandas at its first array, which had better not be amid the episodes.
+        # PyArrow loads pandas at its first array; this loads it before the episodes.
         pa.array(np.empty(0))
 
     def save(self, demonstration: Demonstration) -> None:
@@ -350,7 +350,7 @@ def _stats_of_episodes(root: Path, listed: list[str], names: list[str]) -> dict[
 def taken(root: Path, *, resume: bool) -> Iterator[None]:
     """Makes sure that ``root`` can take a recording, and clears what a killed one left behind.
 
-    As long as the block lasts, nobody else can.
+    No other process can while the block lasts.
 
     Args:
         root: The dataset's folder.

@@ -1,4 +1,4 @@
-"""The task gallery: a card a named task, and on its page a film and what each policy reached."""
+"""The task gallery: a card for each named task, and on its page a film and the results."""
 
 import json
 import os
@@ -20,7 +20,7 @@ def write(path: Path) -> None:
         "# Task gallery",
         "",
         "Every named task is proven to be solvable on all its 1,000 test scenarios; its page has "
-        "the proof, the shapes, and what each policy of ours reaches.",
+        "the certificate, observations and actions, and the results of our policies.",
         "",
     ]
     for family, specs in groupby(hvs_suite.TASKS.values(), lambda spec: spec.family):
@@ -34,7 +34,7 @@ def write(path: Path) -> None:
                 ":link-type: doc",
                 f":img-top: {_film(spec.name, path.parent)}",
                 "",
-                f"{words.target}: {words.tolerance}{held}",
+                f"Target: {words.target}. Tolerance: {words.tolerance}{held}.",
                 ":::",
                 "",
             ]
@@ -77,7 +77,7 @@ def _results(task: str) -> str:
             )
     return "\n".join(
         [
-            "## What our policies reach",
+            "## Results of our policies",
             "",
             "On all test scenarios:",
             "",

@@ -1,9 +1,9 @@
 """Builds the board from result files: Markdown, and one web page that needs no network.
 
 Run as ``python eval/leaderboard.py`` or ``hvs leaderboard``. Results lie as
-``<results>/<policy>/<task>.json`` with their action logs beside them. One that breaks a rule of
-`submission.check`, or does not come out again when its actions are played, stops the build with the
-reason: a board is only as good as its worst row.
+``<results>/<policy>/<task>.json`` with their action logs beside them. A result that breaks a rule
+of `submission.check`, or that differs when its actions are played again, stops the build with the
+reason, because every row of the board has to be trustworthy.
 
 Equal results give equal bytes, on any machine, as long as ``clips`` stays beside the board. What
 was played again once is not played again on the same machine; see `replay_check`.
@@ -42,23 +42,24 @@ def build(
     """Writes ``LEADERBOARD.md`` and ``leaderboard.html``, and the clips beside them.
 
     Args:
-        results_folder: Holds ``<policy>/<task>.json``. Studies of robustness lie likewise in the
-            folder ``robustness`` beside it, as far as there are any.
+        results_folder: Holds ``<policy>/<task>.json``. Robustness studies, if there are any, lie in
+            the same way in the folder ``robustness`` beside it.
         out: Folder to write to; made if missing.
         replay: Scenarios of each new result to play again, drawn anew; a number that a result does
             not have plays all of it.
         reruns: Folder of the maintainers' own results on an unseen split, laid out likewise; see
             `rerun_check`.
         ledger: Where this machine remembers what it played; `replay_check.own_ledger` by default.
-        draft: Show what is no score yet, and say so on the board; see `submission.check`.
-        say: Told what takes time.
+        draft: Also show results that are not scores yet, and mark the board as a draft; see
+            `submission.check`.
+        say: Called with a line of text about each long step.
 
     Returns:
         The two files.
 
     Raises:
-        ResultError: A result is refused, or there is none, or a study of robustness is none; the
-            board stays as it was.
+        ResultError: A result or a robustness study is refused, or there is no result; the board
+            stays as it was.
         OptionError: `replay` is below 1, or the ledger lies among the results.
         OutputError: A file cannot be written.
         RenderError: A clip is to be drawn and nothing here can.

@@ -1,6 +1,6 @@
 """How a policy is scored: scenarios 0..N-1 of a split, the task as named, every episode a row.
 
-Studies may change the task by options; the result says so, and is no score then.
+Studies may change the task by options; the result then records them and is not a score.
 """
 
 import contextlib
@@ -50,9 +50,9 @@ def evaluate(
 ) -> result_file.Result:
     """Scores a policy on the first scenarios of a split and writes the result.
 
-    Interrupted, the same call goes on where it was, and ends in the same result. A person's own
-    code (``module:factory``) plays in a process of its own, which holds no simulator. Scenarios
-    come in an order drawn for this run: no policy learns by counting which one it plays.
+    After an interruption the same call continues, and ends in the same result. Code of one's own
+    (``module:factory``) plays in a process of its own, which holds no simulator. The order of the
+    scenarios is drawn for each run, so that a policy cannot count which one it plays.
 
     Args:
         policy: What `hvs_suite.policies.catalogue.policy_factory` takes, or a contender that was
@@ -60,11 +60,11 @@ def evaluate(
         task: Named task.
         out: Result file to write (JSON); the action log and, meanwhile, what is already played
             stand beside it. None writes nothing.
-        split: Split to play; ``test`` for a score, any other name for a look.
+        split: Split to play; ``test`` for a score, any other name for trying.
         episodes: Scenarios to play: 0 to `episodes` - 1.
         options: Options of the task that differ from the named one, for studies; only the task as
             named is a score.
-        workers: Processes, or others elsewhere; the episodes are the same whoever plays them.
+        workers: Processes, or workers elsewhere; the episodes are the same with any of them.
         decision_limit_s: Time after which a decision loses its episode (s).
         progress: Called after each episode, in the order in which they end; at once for those that
             an interrupted call left.
@@ -119,7 +119,7 @@ def evaluate(
 
 
 def _write(result: result_file.Result, log: bytes, out: Path) -> None:
-    # The log first: a result never stands there without the log that it speaks of.
+    # The log first: a result is never there without its log.
     with files.replacing(result_file.actions_path(out)) as temporary:
         temporary.write_bytes(log)
     result_file.write(result, out)
@@ -127,13 +127,13 @@ def _write(result: result_file.Result, log: bytes, out: Path) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class _Evaluation:
-    """Who plays what, and all else that decides what the trials are.
+    """The policy, the task, and everything else that decides the trials.
 
     Attributes:
-        player: Who plays.
+        player: The policy.
         spec: The task.
         split: Split its scenarios come from.
-        created: When this sitting began.
+        created: When this session began.
         origin: The part of a result's metadata on which its trials depend.
     """
 
@@ -161,7 +161,7 @@ class _Evaluation:
         return cls(player, spec, split, created, origin)
 
     def identity(self) -> dict[str, Any]:
-        """What an interrupted evaluation must have in common with the one that goes on."""
+        """What an interrupted evaluation must have in common with the one that continues it."""
         return {
             "schema_version": result_file.SCHEMA_VERSION,
             "task": self.spec.name,

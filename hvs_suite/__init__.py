@@ -13,9 +13,10 @@ import os
 import platform
 
 if platform.machine() in ("x86_64", "AMD64"):
-    # OpenBLAS has kernels for each generation of processors, which round differently, and a fit
-    # that ends there ends elsewhere: results of servo on surface came out otherwise on another
-    # machine. These run wherever AVX2 does. NumPy asks when it loads; who has set it knows why.
+    # OpenBLAS has kernels for each generation of processors, which round differently, so a fit may
+    # end elsewhere: results of servo on surface differed on another machine. These kernels run on
+    # every processor with AVX2. NumPy reads the variable when it loads. A value that the user has
+    # set stays.
     os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
 
 from hvs_suite.gym import register

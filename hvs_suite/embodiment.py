@@ -27,12 +27,12 @@ EIH_AIM_M = 0.020
 
 @dataclasses.dataclass(frozen=True)
 class Tool:
-    """A peg in a collet on the flange, the eye in the hand beside it.
+    """A peg in a collet on the flange, with the eye in hand beside it.
 
     Attributes:
         peg_diameter_m: Diameter of the peg (m).
         peg_length_m: How far it stands out of the collet (m).
-        edge_m: How far the edge of its tip is broken, sideways; twice that along it (m).
+        edge_m: Width of the chamfer at its tip, sideways; twice as much along it (m).
     """
 
     peg_diameter_m: float = 0.010

@@ -1,12 +1,12 @@
-"""Typed errors: everything a user can do wrong ends in one of these, with one clear line.
+"""Typed errors: every wrong input ends in one of these, with one clear line.
 
-The command line prints the line and exits with 2; libraries can catch the class they expect.
-Each class also derives from the built-in that Python users would reach for.
+The command line prints the line and exits with 2; libraries can catch the class they expect. Each
+class also derives from the built-in that Python users would expect.
 """
 
 
 class HvsError(Exception):
-    """Base of every error that the suite raises for bad input; its text says how to mend it."""
+    """Base of every error that the suite raises for bad input; its text says how to correct it."""
 
 
 class UnknownTaskError(HvsError, LookupError):
@@ -54,30 +54,30 @@ class ServerError(HvsError, ConnectionError):
 
 
 class ClusterError(HvsError, RuntimeError):
-    """A Ray cluster that cannot be joined, or whose machines do not hold what this one holds."""
+    """A Ray cluster that cannot be joined, or whose machines have other packages than this one."""
 
 
 def describe(error: BaseException) -> str:
     """Returns the name and the text of an error, even of one whose own text raises.
 
     Args:
-        error: Of other people's code, say.
+        error: The error, possibly of code outside the suite.
     """
     name, text = type(error).__name__, first_line(error)
     return name if text == name else f"{name}: {text}"
 
 
 def first_line(error: BaseException) -> str:
-    """What an exception of somebody else's code says, as one line.
+    """The message of an exception of code outside the suite, as one line.
 
     Args:
-        error: The exception; it may say nothing, or raise another when it is asked.
+        error: The exception; its message may be empty, or computing it may raise.
 
     Returns:
         The first line of its text, or its type's name.
     """
     try:
         lines = str(error).splitlines()
-    except Exception:  # somebody else's __str__ raises anything
+    except Exception:  # any __str__ may raise anything
         lines = []
     return lines[0] if lines else type(error).__name__

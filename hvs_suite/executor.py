@@ -1,4 +1,4 @@
-"""The one executor: hands indices to workers, and their results on as they come.
+"""The one executor: gives indices to workers and passes on their results as they come.
 
 A worker is made once a process and called once an index. Workers are this process, local processes,
 or whatever else has a `spread`, such as `hvs_suite.on_ray.RayCluster` with actors on many machines.
@@ -20,15 +20,15 @@ from typing import Any, Protocol, cast
 
 from hvs_suite.errors import HvsError, OptionError
 
-# One core a worker: llvmpipe's and OpenMP's own threads would fight over the same cores. Both are
-# read when the libraries load, hence set before a worker starts.
+# One core a worker: llvmpipe's and OpenMP's own threads would compete for the same cores. The
+# libraries read both variables when they load, so they are set before a worker starts.
 WORKER_ENVIRONMENT = {"LP_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 WORKER_EXIT_TIMEOUT_S = 10.0
 TOLD_AHEAD = 3
 """Indices that a worker holds, the one it works on included."""
 
 type Note = Callable[[Any], None]
-"""Tells whoever reads the results how a long call goes."""
+"""Tells the reader of the results how a long call goes."""
 type Make[T] = Callable[[Note], AbstractContextManager[Callable[[int], T]]]
 """Makes and ends a worker's function; module-level function or dataclass, so that it pickles."""
 
@@ -109,13 +109,13 @@ def spread[T](
 
 
 def _unheard(words: Any) -> None:
-    """For workers whose words nobody wants."""
+    """Ignores what workers say."""
 
 
 def _in_processes[T](
     make: Make[T], indices: Sequence[int], workers: int, ahead: int, note: Note
 ) -> Generator[T, None, None]:
-    """Hands indices to spawned workers one by one, and ends every worker whatever happens."""
+    """Gives indices to spawned workers one by one, and ends every worker in any case."""
     try:
         ForkingPickler.dumps(make)
     except Exception as error:
@@ -130,8 +130,8 @@ def _in_processes[T](
                 started.append(_start_worker(make))
         processes = {connection: process for process, connection in started}
         waiting = iter(indices)
-        # What each worker was told and has not answered: always some, so that it plays on while
-        # the caller looks at what it played before.
+        # What each worker was told and has not answered: always some, so that it continues while
+        # the caller uses the results before.
         told = dict.fromkeys(processes, 0)
         for connection in [*processes] * ahead:
             told[connection] += _send_next(connection, waiting)
@@ -161,7 +161,7 @@ def _in_processes[T](
 
 @contextlib.contextmanager
 def worker_conditions() -> Iterator[None]:
-    """Environment variables and signals as a new worker shall inherit them.
+    """Sets environment variables and signals for new workers to inherit.
 
     A worker ignores Ctrl-C from its first instruction on: the terminal sends it to the whole
     group, and only the process that asked for the work should answer.
@@ -216,14 +216,14 @@ def _receive(connection: Connection, processes: Mapping[Connection, SpawnProcess
 
 
 def _work(connection: Connection, make: Make[Any]) -> None:
-    """A worker's life: build, do what it is told until the end is told, close."""
+    """Runs a worker: builds it, calls it until the end is told, and closes it."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         with make(lambda words: connection.send(("note", words))) as call:
             while (index := connection.recv()) is not None:
                 connection.send(("result", call(index)))
     except Exception as error:
-        # Where the pipe itself has gone, so has whoever could be told.
+        # If the pipe is closed, no process is left to be told.
         with contextlib.suppress(OSError):
             connection.send(failure(error))
 
@@ -231,7 +231,7 @@ def _work(connection: Connection, make: Make[Any]) -> None:
 def _end_with_parent() -> None:
     """Ends this process once its parent has ended, however that was killed.
 
-    A call may take an hour, and would keep its folder from whoever goes on.
+    A call may take an hour, and would keep its folder locked for the next command.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -240,7 +240,7 @@ def _end_with_parent() -> None:
 
 
 def failure(error: Exception) -> tuple[Any, ...]:
-    """What a worker sends in place of a result; :func:`opened` raises it again."""
+    """An error that a worker sends in place of a result; :func:`opened` raises it again."""
     if isinstance(error, HvsError):
         return "error", type(error), str(error), ""
     return "error", None, f"{type(error).__name__}: {error}", traceback.format_exc()

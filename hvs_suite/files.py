@@ -1,4 +1,4 @@
-"""Writing files so that a reader never sees half of one, and no second writer comes between."""
+"""Writing files so that a reader never sees half of one, and two writers never mix."""
 
 import contextlib
 import fcntl
@@ -14,7 +14,7 @@ from hvs_suite.errors import OutputError
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Write a file under a temporary name and rename it once it is whole.
 
-    An error or an interrupt inside the block leaves whatever stood at ``path`` before.
+    After an error or an interrupt inside the block, ``path`` is as it was before.
 
     Args:
         path: The file to write; missing parent folders are made.
@@ -47,7 +47,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Find out before long work that its result could not be written.
+    """Check before long work that its result can be written.
 
     Args:
         path: A file to be written later; missing parent folders are made now.
@@ -66,10 +66,10 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     if os.path.isdir(target):
         raise OutputError(f"{target} is a folder; name a file")
     if os.path.exists(target) and not os.path.isfile(target):
-        # A FIFO or a device that is replaced is lost to whatever else uses it.
+        # Other programs would lose a FIFO or a device that is replaced.
         raise OutputError(f"{target} is no regular file; choose another path")
     try:
-        # Permissions do not tell all: root has any, and some file systems take no files.
+        # Permissions are not enough: root has all of them, and some file systems accept no files.
         with tempfile.NamedTemporaryFile(
             dir=target.parent, prefix=f".{target.stem}-", suffix=target.suffix
         ):
@@ -82,7 +82,7 @@ def check_writable(path: str | os.PathLike[str]) -> None:
 
 @contextlib.contextmanager
 def only_writer(folder: Path) -> Iterator[None]:
-    """Be the only one that writes into a folder; ends with the process, however that ends.
+    """Lock a folder for this writer alone; the lock ends with the process, however that ends.
 
     Args:
         folder: An existing folder.

@@ -99,7 +99,7 @@ class TaskEnv(gymnasium.Env[Any, npt.NDArray[np.float32]]):
 
     @property
     def environment(self) -> Any:
-        """The ``dm_env`` environment behind this one, for what Gymnasium has no name for."""
+        """The ``dm_env`` environment behind this one, for what Gymnasium does not provide."""
         return self._environment
 
     def reset(
@@ -196,16 +196,16 @@ class GoalEnv(TaskEnv):
     tool's tip is; ``desired_goal``, where it has to be: each a position (3,) in m and the direction
     of the tool's axis (3,), base frame.
 
-    The reward is 1 at the end of a control step inside the task's bounds, without a collision, and
-    0 elsewhere, because it has to follow from the two goals: of a hold of several steps and of
-    figures over an episode it knows nothing, ``info["is_success"]`` does.
+    The reward is 1 at the end of a control step inside the task's bounds and without a collision,
+    and 0 otherwise. It has to follow from the two goals alone, so it ignores holds of several steps
+    and metrics over an episode; ``info["is_success"]`` counts them.
 
     Args:
         task: Registered name, such as ``align-thesis``.
         **options: As for `TaskEnv`, without ``observations`` and ``rewards``.
 
     Raises:
-        OptionError: What the task bounds does not follow from where the tip is, or an option is one
+        OptionError: A bound of the task does not follow from where the tip is, or an option is one
             of those two.
     """
 
@@ -242,11 +242,11 @@ class GoalEnv(TaskEnv):
     def compute_reward(
         self, achieved_goal: npt.NDArray[Any], desired_goal: npt.NDArray[Any], info: Any
     ) -> npt.NDArray[np.float32]:
-        """Judge tips against goals, whichever step and episode either is from.
+        """Compare tips with goals, of any steps and episodes.
 
         Args:
             achieved_goal: Where the tip is, (6,) or (n, 6).
-            desired_goal: Where it has to be, as many.
+            desired_goal: Where it has to be, in the same shape.
             info: Of the step, or (n,) of them; ``collision`` is read where it is there.
 
         Returns:
@@ -283,8 +283,8 @@ def _joined(parts: Sequence[spaces.Space[Any]]) -> spaces.Box:
 class OwnTimeLimit(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
     """Tells Gymnasium when the environment itself ends an episode: ``spec.max_episode_steps``.
 
-    Gymnasium's own limit stays away, so that a goal on the last step is an end of the task alone;
-    a shorter ``max_episode_steps`` of `gymnasium.make` puts it in between.
+    Gymnasium's own time limit is not added, so that a goal on the last step terminates the episode
+    without truncating it. A shorter ``max_episode_steps`` of `gymnasium.make` adds it.
 
     Args:
         env: A `TaskEnv`, wrapped by `gymnasium.make`.

@@ -1,8 +1,8 @@
-"""Names that strangers give: refused where they could mislead, shown so that they cannot.
+"""Names from other people: refused where they could mislead, and shown safely.
 
-A name ends up in a terminal, in Markdown and on a web page. There, a line break, an escape sequence
-or a mark that turns the direction of writing makes it say something else than it is, and an
-invisible character makes two names of one.
+A name is shown in a terminal, in Markdown and on a web page. There, a line break, an escape
+sequence or a mark that turns the direction of writing changes what a reader sees, and with
+invisible characters two different names look the same.
 """
 
 import unicodedata
@@ -35,7 +35,7 @@ def check_name(name: str, what: str, *, error: type[HvsError]) -> str:
 
     Args:
         name: The name.
-        what: What bears it, for the message.
+        what: What has this name, for the message.
         error: Raised where it cannot.
 
     Returns:
@@ -75,7 +75,7 @@ def look_alike(name: str, names: Iterable[str]) -> str | None:
     difference.
 
     Args:
-        name: A stranger's name.
+        name: A name from other people.
         names: Those it may not pass for.
 
     Returns:
@@ -91,6 +91,6 @@ def _is_seen(character: str) -> bool:
 
 
 def _skeleton(name: str) -> str:
-    # Compatibility first, casefold after it, and apart once more what casefold has put together.
+    # First the compatibility form, then casefold, then decompose again what casefold has composed.
     folded = unicodedata.normalize("NFKD", unicodedata.normalize("NFKC", name).casefold())
     return "".join(c for c in folded.translate(_LOOK_ALIKES) if c.isalnum())

@@ -1,11 +1,11 @@
-"""Workers on the machines of a Ray cluster (https://docs.ray.io), an actor a core.
+"""Workers on the machines of a Ray cluster (https://docs.ray.io), one actor for each core.
 
-What they bring is what local processes bring. An actor builds its environment and its policy once
-and is told a few indices ahead, so that neither it nor the reader waits for the other, and no more
-than these few results of each wait to be read. Actors for which there is no room yet wait for it:
-machines may join meanwhile. What a machine that dies was working on is worked on by others.
+They give the same results as local processes. An actor builds its environment and its policy once
+and is told a few indices ahead, so that neither it nor the reader waits for the other, and at most
+these few results of each actor wait to be read. Actors without a free core wait for one, because
+machines may join later. If a machine dies, other actors do its work again.
 
-Nothing else in the suite imports Ray, and this module only once it is asked for actors.
+No other module imports Ray, and this one imports it only when actors are needed.
 """
 
 import collections
@@ -44,7 +44,7 @@ sorts results has to keep them until that comes, up to half a minute after a mac
 LOOK_ROUND_S = 1.0
 """Time after which the cluster is looked at again, in case it has grown (s)."""
 KNOCK_S = 5.0
-# Whatever can change a physics state, a picture, or a policy's answer to it.
+# Packages that can change a physics state, a picture, or a policy's action.
 PACKAGES = ("mujoco", "dm-control", "numpy", "opencv-python-headless", "pin", "ruckig", "torch")
 
 
@@ -137,10 +137,10 @@ def join(address: str) -> Any:
 
 
 def _check_reachable(address: str) -> None:
-    """Knocks at an address, where Ray would for many minutes.
+    """Checks that something answers at an address; Ray itself would try for many minutes.
 
     Raises:
-        ClusterError: Nobody answers.
+        ClusterError: Nothing answers.
     """
     if address in ("auto", LOCAL) or "://" in address:
         return
@@ -155,7 +155,7 @@ def _check_reachable(address: str) -> None:
 
 
 def remote(ray: Any, kind: type) -> Callable[..., Any]:
-    """What starts actors of a class: on a core each, under the conditions of a local worker.
+    """A factory of actors of a class: on a core each, under the conditions of a local worker.
 
     Args:
         ray: As `join` returns it.
@@ -166,7 +166,7 @@ def remote(ray: Any, kind: type) -> Callable[..., Any]:
 
 @dataclasses.dataclass(eq=False)
 class _Actor:
-    """An actor and what it owes.
+    """An actor and the answers that are expected of it.
 
     Attributes:
         handle: Ray's handle of it.
@@ -189,7 +189,7 @@ class _Actor:
 
 
 class _Crew:
-    """The actors of one `RayCluster.spread`, and who does what.
+    """The actors of one `RayCluster.spread`, and the work of each.
 
     An index goes by its place in the order in which they are to be handed out.
     """
@@ -206,7 +206,7 @@ class _Crew:
         self._cluster = cluster
         self._indices = indices
         self._ahead = ahead
-        # A heap: what was lost is the oldest, and goes first.
+        # A heap: lost work is the oldest, and is done first.
         self._waiting = list(range(len(indices)))
         self._actors: list[_Actor] = []
         self._ended: collections.Counter[int | None] = collections.Counter()
@@ -298,14 +298,14 @@ class _Crew:
             actor.told.append((place, actor.handle.call.remote(self._indices[place])))
 
     def _lose(self, actor: _Actor, error: Exception) -> None:
-        """Takes an actor that is gone off the list, and its work back.
+        """Removes an actor that is gone, and puts its work back.
 
         Raises:
-            RuntimeError: It was its work that ended it and others before, or none can be made.
+            RuntimeError: Its work ended this actor and others before, or no actor can be made.
         """
         self._actors.remove(actor)
         self._next_look = 0.0
-        # It may live, and only what it answered be lost.
+        # The actor may be alive, and only its answer lost.
         self._ray.kill(actor.handle)
         for place, _ in actor.told:
             heapq.heappush(self._waiting, place)
@@ -324,7 +324,7 @@ class _Crew:
         return any(node["NodeID"] == machine and node["Alive"] for node in self._ray.nodes())
 
     def _check(self, there: Mapping[str, str]) -> None:
-        """Refuses a machine whose results may be others.
+        """Refuses a machine whose results may differ.
 
         Raises:
             ClusterError: It has other packages, or another state of the suite.

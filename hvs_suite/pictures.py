@@ -1,4 +1,4 @@
-"""Pictures and films of an episode: the cell beside what its policy sees and how it stands.
+"""Pictures and films of an episode: the cell, what its policy sees, and its state in figures.
 
 A film frame is drawn from an environment as it stands, so any loop can make one a control step:
 the cell, both camera images enlarged without smoothing (their pixels are what a policy gets), the

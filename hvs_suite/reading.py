@@ -1,8 +1,8 @@
-"""Reading what may come from a stranger: one bounded reader a format.
+"""Reading files that may come from other people: one bounded reader for each format.
 
-Each refuses what is no regular file, is larger than its caller allows, or would unpack to more than
-that, before it is read; and each ends in the caller's own typed error, with one line. Nothing here
-loads pickles.
+Before reading, each refuses anything that is not a regular file, is larger than its caller allows,
+or would unpack to more than that. Each raises the caller's own typed error, with one line. Nothing
+here loads pickles.
 """
 
 import io
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 MOST_JSON_BYTES = 64 * 2**20
 """Larger than any JSON file of ours: a result of 1,000 scenarios takes 1 MB."""
-# Far deeper than any file of ours; Python's parser itself gives up at about a thousand.
+# Far deeper than any file of ours; Python's own parser fails at about a thousand.
 _MOST_JSON_DEPTH = 64
 _NPZ_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _ENCRYPTED = 0x1
@@ -156,7 +156,7 @@ def read_object(
 def validated[Model: pydantic.BaseModel](
     model: type[Model], content: Any, what: object, *, error: type[HvsError]
 ) -> Model:
-    """Hold parsed JSON against a model.
+    """Validate parsed JSON with a model.
 
     Args:
         model: What it should be.
@@ -390,7 +390,7 @@ def _read_texts(
 def _choose_columns(
     path: Path, file: "pq.ParquetFile", columns: Sequence[str] | None, error: type[HvsError]
 ) -> tuple[list[str], list[str]]:
-    """Check what the footer says of the columns to be read; they, and those of text among them."""
+    """Check the footer's description of the columns to read; return them, and the text columns."""
     names = file.schema_arrow.names
     wanted = names if columns is None else [name for name in names if name in columns]
     lacking = sorted(set(columns or ()) - set(names))
@@ -408,7 +408,7 @@ def _choose_columns(
     for group in map(file.metadata.row_group, range(file.metadata.num_row_groups)):
         for _, index in leaves:
             chunk = group.column(index)
-            # A run of a billion values that are alike, or missing, takes but a few bytes.
+            # A run of a billion equal or missing values takes only a few bytes.
             least = _ARROW_BYTES * max(chunk.num_values, group.num_rows)
             unpacked += max(chunk.total_uncompressed_size, least)
     if unpacked > MOST_PARQUET_BYTES:

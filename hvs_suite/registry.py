@@ -1,4 +1,4 @@
-"""The registry: from a task's name to a ready environment.
+"""The registry: makes environments from task names.
 
 The suite's own families are imported here, the only place above ``tasks`` that names them; those of
 other packages are found by their entry points (see `hvs_suite.tasks.shared.family`).
@@ -92,7 +92,7 @@ def announced(spec: Spec) -> Spec:
         spec: Parameters, of a named task or changed from one.
 
     Returns:
-        The same, or where the changes come unannounced, the named task's.
+        The same parameters; those of the named task if the changes are unannounced.
 
     Raises:
         UnknownTaskError: The spec's name is not registered.
@@ -122,7 +122,7 @@ def make_task(spec: Spec, split: str) -> "ArmTask":
 
     Raises:
         UnknownTaskError: The spec's name is not registered.
-        OptionError: The spec asks for what cannot be.
+        OptionError: The spec cannot be fulfilled.
         ScenarioError: The split's name is empty.
     """
     from hvs_suite.tasks.shared.arm_task import ArmTask
@@ -152,7 +152,7 @@ def load(
     spec = find(name).with_options(options)
     if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or seed < 0):
         raise OptionError(f"seed is {seed!r}; use a whole number from 0 up, or None")
-    # MuJoCo takes half a second to import: listing tasks must not pay for it.
+    # MuJoCo takes half a second to import, which listing tasks does not need.
     from hvs_suite.tasks.shared.environment import Environment
 
     return Environment(make_task(spec, split), seed=seed)

@@ -2,7 +2,7 @@
 
 Evaluation, recording and DAgger all go through `play`. A scenario is a pure function of its index,
 so the result does not depend on how many workers there are, where they are, or which one plays
-what. This module imports no room: environments and policies come in as factories.
+what. This module imports no other part of the suite: environments and policies come as factories.
 """
 
 import contextlib
@@ -51,7 +51,7 @@ def tell(policy: Any, env: Any) -> None:
 
 
 class Environment(Protocol):
-    """What the executor needs of an environment; `hvs_suite.load` returns one."""
+    """What the executor needs from an environment; `hvs_suite.load` returns one."""
 
     @property
     def info(self) -> Mapping[str, Any]:
@@ -287,8 +287,8 @@ def carried[T](make: T) -> T:
     """A factory that needs no file of this machine.
 
     Args:
-        make: If it `ReadsFolder`, or is a dataclass around one that does, what lies in the folder
-            travels with it, but for sub-folders, where trainings keep what no policy reads.
+        make: If it `ReadsFolder`, or is a dataclass around one that does, it takes the folder's
+            files with it, except for sub-folders, which policies do not read.
     """
     if not dataclasses.is_dataclass(make) or isinstance(make, type):
         return make
@@ -325,9 +325,9 @@ def _checked(action: Any, shape: Sequence[int], scenario: int, step: int) -> Act
 def library_seeds(seed: int) -> Iterator[None]:
     """Starts the global generators of Python, NumPy and, if it is loaded, torch anew for a while.
 
-    The suite uses none of them. Policies written elsewhere do (diffusion policies draw their noise
-    from torch's), and would otherwise depend on which scenarios a worker played before. Afterwards
-    the generators are as they were: the caller's own draws do not notice.
+    The suite uses none of them, but other policies do (diffusion policies draw their noise from
+    torch's generator), and would otherwise depend on which scenarios a worker played before.
+    Afterwards the generators are as they were, so the caller's own draws are unchanged.
 
     Args:
         seed: In [0, 2^32).

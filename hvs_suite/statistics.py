@@ -1,4 +1,4 @@
-"""Estimates, intervals and tests that results report, each with its source. Imports no room."""
+"""Estimates, intervals and tests for results, each with its source. Imports no other part."""
 
 import dataclasses
 import math
@@ -95,8 +95,8 @@ def mean_rate_interval(
 def interquartile_mean(values: npt.ArrayLike) -> float:
     """Returns the mean of the middle half: a quarter of the values is cut off at each end.
 
-    Less noisy than the median and deaf to outliers, unlike the mean. The number cut at each end
-    is n/4 rounded down, as in SciPy's ``trim_mean(values, 0.25)``.
+    It is less noisy than the median, and outliers do not affect it as they affect the mean. The
+    number cut at each end is n/4 rounded down, as in SciPy's ``trim_mean(values, 0.25)``.
 
     Source: R. Agarwal et al., "Deep reinforcement learning at the edge of the statistical
     precipice", NeurIPS 2021.

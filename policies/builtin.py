@@ -1,4 +1,4 @@
-"""Policies that need no learning: the floor that others are measured against."""
+"""Policies that need no learning: the lower bound for all others."""
 
 import hashlib
 from typing import Any, Protocol
@@ -41,7 +41,7 @@ class ZeroPolicy:
 
 
 class RandomPolicy:
-    """Uniform actions in [-1, 1], the same in a scenario whoever plays it and whatever came before.
+    """Uniform actions in [-1, 1], a function of the scenario alone.
 
     Args:
         env: Where it acts.

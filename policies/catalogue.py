@@ -1,5 +1,6 @@
 """Finds policies by name: baselines, shipped weights, a checkpoint here or on the Hub, own code."""
 
+import dataclasses
 import difflib
 import os
 from collections.abc import Mapping
@@ -9,7 +10,7 @@ from typing import Any
 
 from hvs_suite.errors import PolicyError
 from hvs_suite.policies import imported
-from hvs_suite.policies.checkpoints import hub
+from hvs_suite.policies.checkpoints import files, hub
 from hvs_suite.policies.recipe import trained_on
 from hvs_suite.registry import announced, find
 from hvs_suite.rollout import PolicyFactory
@@ -51,6 +52,29 @@ def policy_factory(spec: str, task: str, options: Mapping[str, Any] = AS_NAMED) 
     return _checkpoint(checkpoint_folder(spec, task), played)
 
 
+def demonstrator_factory(
+    spec: str, task: str, options: Mapping[str, Any] = AS_NAMED
+) -> PolicyFactory:
+    """Find a policy that demonstrates a task, which may know what is true.
+
+    Args:
+        spec: As in `policy_factory`; the factory of ``module:factory`` is called with the
+            environment itself.
+        task: Named task.
+        options: Options that it is played with, where they differ from it.
+
+    Returns:
+        Builds the policy for an environment; pickles.
+
+    Raises:
+        HvsError: As `policy_factory`.
+    """
+    make = policy_factory(spec, task, options)
+    if isinstance(make, imported.ImportedFactory):
+        return dataclasses.replace(make, knows_truth=True)
+    return make
+
+
 def checkpoint_folder(spec: str, task: str) -> Path:
     """Find a checkpoint for a task.
 
@@ -76,6 +100,11 @@ def checkpoint_folder(spec: str, task: str) -> Path:
         return Path(spec)
     if hub.NAME.fullmatch(spec):
         return hub.fetch(spec)
+    if spec in files.POLICIES:
+        raise PolicyError(
+            f"{spec} is a type of policy, not a trained one; name the folder of one, such as "
+            f"RUN/{LAST_CHECKPOINT} after lerobot-train"
+        )
     close = difflib.get_close_matches(spec, NAMES, n=1)
     hint = (
         f"did you mean {close[0]}?"
@@ -86,7 +115,7 @@ def checkpoint_folder(spec: str, task: str) -> Path:
 
 
 def name_of(folder: Path) -> str:
-    """A checkpoint's folder as notes have it: shipped weights lie elsewhere on each machine.
+    """A checkpoint's folder as notes name it: shipped weights without this machine's path.
 
     Args:
         folder: As `checkpoint_folder` gives it.
@@ -119,7 +148,7 @@ def _builtin(name: str) -> PolicyFactory:
 def _checkpoint(folder: Path, task: Spec) -> PolicyFactory:
     """Check a checkpoint here and now, before workers are started for it."""
     try:
-        from hvs_suite.policies.checkpoints import files, loading
+        from hvs_suite.policies.checkpoints import loading
         from hvs_suite.policies.sac import playing
     except ImportError as error:
         raise PolicyError(f"playing {folder} needs torch; install hvs-suite[learn]") from error

@@ -1,7 +1,7 @@
-"""What a policy that is not ours may know of a task: its name, its spaces, its nominal figures.
+"""What other people's policies may know of a task: its name, spaces and nominal figures.
 
 The expert, which reads the true state, and random, which starts its stream from the scenario, get
-the environment itself. Everybody else gets a `PolicyContext`: what the task's preset shows, and
+the environment itself. All other policies get a `PolicyContext`: what the task's preset shows, and
 nothing that only training may see.
 """
 
@@ -50,7 +50,7 @@ class PolicyContext:
 
 @dataclasses.dataclass(frozen=True)
 class Blindfolded:
-    """Builds a policy that gets to know no more than a `PolicyContext`.
+    """Builds a policy that knows nothing but a `PolicyContext`.
 
     Attributes:
         make: Builds the policy for a context.
@@ -59,5 +59,5 @@ class Blindfolded:
     make: PolicyFactory
 
     def __call__(self, env: Any) -> Policy:
-        """Builds the policy for an environment that it never gets hold of."""
+        """Builds the policy for an environment to which it has no access."""
         return self.make(PolicyContext.of(env))

@@ -1,10 +1,10 @@
-"""Plays a person's own code: ``module:factory``, anything with ``reset`` and ``select_action``.
+"""Plays code of one's own: ``module:factory``, anything with ``reset`` and ``select_action``.
 
 How to write such a module: docs/your-policy.md.
 
-Importing the module runs its code with all the rights of whoever evaluates it. Nothing in the suite
-does so unless that name was typed on the command line or passed to `policy_factory`; a score is
-played in a process apart (see `hvs_suite.eval.serving.policy_process`).
+Importing the module runs its code with all the rights of the user. The suite does so only if that
+name was typed on the command line or passed to `policy_factory`; a score is played in a separate
+process (see `hvs_suite.eval.serving.policy_process`).
 """
 
 import dataclasses
@@ -31,11 +31,14 @@ class ImportedFactory:
         module: Importable name.
         factory: Callable in it; takes a `PolicyContext`.
         place: Folder that is searched before the rest of the path: where the command was given.
+        knows_truth: Give the factory the environment itself in place of a `PolicyContext`: for
+            demonstrators, which may know what is true.
     """
 
     module: str
     factory: str
     place: str
+    knows_truth: bool = False
 
     def __call__(self, env: Any) -> Policy:
         """Imports the module, which runs its code, and builds the policy for an environment.
@@ -47,12 +50,13 @@ class ImportedFactory:
         name = f"{self.module}:{self.factory}"
         make = self._callable()
         try:
-            policy: Any = make(PolicyContext.of(env))
+            policy: Any = make(env if self.knows_truth else PolicyContext.of(env))
         except PolicyError:
             raise
-        except (Exception, SystemExit) as error:  # other people's code raises anything
+        except (Exception, SystemExit) as error:  # foreign code may raise anything
             raise PolicyError(
-                f"{name} cannot be built ({describe(error)}); a factory takes one PolicyContext"
+                f"{name} cannot be built ({describe(error)}); a factory takes one "
+                f"{'Environment' if self.knows_truth else 'PolicyContext'}"
             ) from error
         for method in ("reset", "select_action"):
             if not callable(getattr(policy, method, None)):
@@ -80,12 +84,12 @@ class ImportedFactory:
             raise PolicyError(f"cannot import {self.module}: there is no module of this name")
         return Path(spec.origin) if spec.has_location and spec.origin else None
 
-    def _callable(self) -> Callable[[PolicyContext], Any]:
+    def _callable(self) -> Callable[[Any], Any]:
         if self.place not in sys.path:
             sys.path.insert(0, self.place)
         try:
             module = importlib.import_module(self.module)
-        except (Exception, SystemExit) as error:  # somebody else's module raises anything
+        except (Exception, SystemExit) as error:  # a foreign module may raise anything
             raise PolicyError(f"cannot import {self.module}: {describe(error)}") from error
         found = getattr(module, self.factory, None)
         if not callable(found):

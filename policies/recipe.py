@@ -1,7 +1,7 @@
-"""How the shipped weights were made: for each named task, the commands that make them again.
+"""How the shipped weights were made: the commands of each named task, to repeat it.
 
 ``recipes/<task>.json`` holds the training command of a policy and, where the suite ships a
-fine-tuned one, the command that makes it; the dataset's recipe in the room of the datasets has the
+fine-tuned one, the command that makes it; the dataset's recipe in ``datasets/recipes`` has the
 recording command. Tasks that differ in tolerance alone share a policy.
 """
 

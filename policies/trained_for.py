@@ -1,8 +1,8 @@
 """What a policy was trained for, as its checkpoint says it, and whether a task is that.
 
-A network that learned at ten decisions a second, over a level table, takes everything else for the
-same: it would play it, and badly, without a word. So ``config.json`` names the family of tasks, the
-control period and the options of the task. Checkpoints from before these were kept are of the
+A network that learned at ten decisions a second, over a level table, cannot notice that a task
+differs: it would play it badly without any warning. So ``config.json`` names the family of tasks,
+the control period and the options of the task. Checkpoints from before these were kept are of the
 family ``align``, at 0.1 s, without options.
 """
 
@@ -97,7 +97,7 @@ def check_trained_for(config: Mapping[str, Any], folder: Path, spec: Spec) -> No
     """
     content = {name: config[name] for name in TrainedFor.model_fields if name in config}
     if not content and config.get("type") not in OURS:
-        # Other people's policies do not say it; their inputs and actions are all that is known.
+        # Policies of other packages do not tell; only their inputs and actions are known.
         return
     trained = validated(TrainedFor, content, folder / "config.json", error=PolicyError)
     played = trained_for(spec)

@@ -1,8 +1,8 @@
 """``align``: hold the flange over a target, facing it, at a set distance, within tolerance.
 
 The thesis's task with its defects removed. The target is one marker on the work surface, which is
-level in the named tasks and tilted or curved in studies. The arm may go on past its goal, so that
-one can see where a policy settles.
+level in the named tasks and tilted or curved in studies. Episodes may go on past the goal, to show
+where a policy settles.
 """
 
 import dataclasses
@@ -88,35 +88,35 @@ class Align(Placing[AlignSpec, AlignScenario]):
 
     hard: ClassVar[Mapping[str, str]] = {
         "align-fixed": (
-            "Nothing: ten places, seen from a known start, and wide tolerances. It shows "
-            "whether a policy learns at all."
+            "Nothing: ten places, a known start, and wide tolerances. It shows whether a policy "
+            "learns at all."
         ),
         "align-easy": (
-            "The target may lie anywhere on the ring, so that the way has to be read from the "
+            "The target may lie anywhere on the ring, so a policy has to find it in the "
             "pictures; the upright arm hides some targets from the eye to hand."
         ),
         "align-thesis": (
-            "A millimetre, where a pixel of the eye to hand shows eight: the last part of the "
-            "way has to be servoed with the eye in the hand."
+            "The tolerance is a millimetre, but a pixel of the eye to hand covers eight: the "
+            "last part of the way has to be servoed with the eye in the hand."
         ),
         "align-hard": (
             "Light, colours and texture change, the eye to hand stands up to a centimetre and a "
-            "degree from where it should, and the start may be anywhere: the far camera says "
-            "only about where the target is."
+            "degree from its nominal pose, and the arm may start anywhere: the eye to hand "
+            "shows only roughly where the target is."
         ),
         "align-drill": (
-            "A quarter of a millimetre over a small disc, held for five steps. Encoders are off "
-            "by up to a tenth of a degree and commands act a step late, so neither the joints "
-            "nor the last picture can be trusted to the tolerance."
+            "A quarter of a millimetre over a small disc, held for five steps. Encoders have "
+            "errors of up to a tenth of a degree and commands act a step late, so neither the "
+            "joints nor the last picture are precise enough alone."
         ),
         "align-limit": (
-            "A tenth of a millimetre and a fifth of a degree: what the controller and the "
-            "pictures still give when nothing disturbs them."
+            "A tenth of a millimetre and a fifth of a degree: the limit of what the controller "
+            "and the pictures allow without disturbances."
         ),
     }
 
     def surface(self) -> "Surface":
-        """The surface that was asked for."""
+        """The surface that the spec names."""
         from hvs_suite.cell.surface import Surface
 
         self._surface = Surface(shape=self.spec.surface, size_m=self.spec.surface_size_m)

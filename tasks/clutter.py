@@ -1,15 +1,15 @@
-"""``clutter``: place the flange over the right thing, among others, without touching anything.
+"""``clutter``: place the flange over the right object, without touching anything.
 
 Three things make it hard. *Distractors*: discs of other colours, and squares, rings and half discs
 of the target's own. The rule: the target is the one whole disc of its colour; everything else
 differs from it in colour or in outline, and lies at least ``spacing_m`` away. *Choice*: several
 discs, and the sentence and an observation say the colour of the one that is meant. *Obstacles*:
 posts, boxes and an overhang, which may hide the target from the eye to hand; one of them moves
-along a lane that is painted on the surface, at a moment that nobody is told. Touching anything
-ends the episode. A way around all of them exists by the rule of `hvs_suite.tasks.shared.room`.
+along a lane that is painted on the surface, and the policy is not told when. Touching anything ends
+the episode. A way around all of them exists by the rule of `hvs_suite.tasks.shared.room`.
 
-The expert keeps off the whole lane until what moves there has come to rest: it knows no more than
-the paint shows.
+The expert avoids the whole lane until the moving obstacle has come to rest, because it also knows
+only the paint.
 """
 
 import dataclasses
@@ -129,17 +129,18 @@ class Clutter(Placing[ClutterSpec, ClutterScenario]):
 
     hard: ClassVar[Mapping[str, str]] = {
         "clutter-distractors": (
-            "Squares, rings and half discs have the target's colour, other discs its outline; "
-            "only both together tell which thing is meant, from far off and at a slant."
+            "Squares, rings and half discs have the target's colour, and other discs have its "
+            "outline. Only colour and outline together identify the target, also from far away "
+            "and at a slant."
         ),
         "clutter-choice": (
-            "The pictures do not say which disc is meant; the sentence and an observation do, "
-            "so that a policy has to join the two."
+            "The pictures do not show which disc is meant; the sentence and an observation say "
+            "it, so a policy has to combine the two."
         ),
         "clutter-obstacles": (
             "Posts, boxes and an overhang stand in the way and may hide the target from the eye "
-            "to hand, and one of them moves at a moment that nobody knows. Touching anything "
-            "ends the episode."
+            "to hand, and one of them moves at an unknown moment. Touching anything ends the "
+            "episode."
         ),
     }
 
@@ -200,7 +201,7 @@ class Clutter(Placing[ClutterSpec, ClutterScenario]):
                 self._props.put(physics, each)
         self.marker_geom = self._disc_geoms[disc_name(scenario.colour)]
         self._obstacles.begin(physics, self._props, scenario.placed, scenario.motion)
-        # The picture that follows shows where bodies were computed to be.
+        # The next picture shows the bodies where they were last computed.
         mujoco.mj_kinematics(physics.model.ptr, physics.data.ptr)
 
     def advance(self, physics: "mjcf.Physics", time_s: float) -> None:

@@ -7,8 +7,9 @@ collision, and is called an overload.
 
 In ``insert-feel`` the hole is not quite where the paint says. No picture shows that, so the last
 millimetre has to be felt: by the wrench at the flange, and by where the tip stops. **The expert of
-that variant knows the hole**, which no learner can see: it goes straight in. Whoever imitates it
-learns where holes are on average, which is not enough; the way to search has to be found out.
+that variant knows the hole**, which no learner can see, and goes straight in. A policy that
+imitates it learns where holes are on average, which is not enough; it has to learn the search by
+itself.
 """
 
 import dataclasses
@@ -99,7 +100,7 @@ class InsertSpec(PegSpec):
 
     @property
     def look_from_m(self) -> float:
-        """So high that the peg does not hide the bushing."""
+        """High enough that the peg does not hide the bushing."""
         return LIFT_M
 
     @property
@@ -154,7 +155,7 @@ class InsertScenario(Scenario):
 
     Attributes:
         target: Where the paint says the hole is, on the surface below it, (3,) m, base frame.
-        hole_offset: By how much the hole itself is elsewhere, (2,) m; nobody sees it.
+        hole_offset: Displacement of the hole from its paint, (2,) m; it cannot be seen.
     """
 
     target: FloatArray
@@ -174,19 +175,20 @@ class Insert(Family[InsertSpec, InsertScenario]):
             "millimetres, and the tip may touch nothing but the bushing."
         ),
         "insert-jig": (
-            "Clearance and chamfer catch the tip within 0.7 mm, while encoders that are a little "
-            "off, light, colours and noise disturb what is seen; and the arm may start anywhere."
+            "Clearance and chamfer catch the tip within 0.7 mm, but small encoder errors, "
+            "light, colours and noise disturb what is measured, and the arm may start anywhere."
         ),
         "insert-feel": (
-            "The hole is off its paint by half a millimetre a direction, which no picture shows: "
-            "it has to be felt by the wrench and by where the tip stops, gently and in time. The "
-            "demonstrations do not show how, because the expert knows the hole."
+            "The hole is displaced from its paint by half a millimetre a direction, which no "
+            "picture shows. A policy has to find it by the wrench and by where the tip stops, "
+            "gently and in time. The demonstrations do not show how, because the expert knows "
+            "the hole."
         ),
     }
     certificate_passes: ClassVar[int] = 4
 
     def build(self, cell: "Cell") -> None:
-        """Stand the bushing there, with its hole, and feel what the peg presses with."""
+        """Add the bushing with its hole, and the sensors of what the peg presses with."""
         self._check_reach()
         self._peg = PegAndBushing(cell, self.spec)
 
@@ -267,13 +269,14 @@ class Insert(Family[InsertSpec, InsertScenario]):
 
     @classmethod
     def certify(cls, env: "Environment", scenarios: Iterable[int]) -> list["Check"]:
-        """Reachable, in time, observable, accurate; what feeling has to do where sight ends."""
+        """Reachable, in time, observable, accurate; and what has to be found by feel."""
         from hvs_suite.tasks.shared import certificate
         from hvs_suite.tasks.shared import certificate_insert as insertion
 
         return [
             *certificate.check_geometry(env, scenarios),
-            # So small a thing is often half hidden behind the arm, and its middle misjudged.
+            # The arm often hides half of so small a thing, and then its middle is estimated
+            # wrongly.
             *certificate.check_visibility(env, scenarios, needed_share=95.0),
             *insertion.check_sight(env, scenarios),
             *insertion.check_feeling(env, scenarios),

@@ -1,9 +1,9 @@
-"""``sequence``: reach one target after the other, each in a time of its own.
+"""``sequence``: reach one target after another, each within a time of its own.
 
 The thesis's full task. Targets lie on the ring, one at a time. A target vanishes when it was
 reached, or when its time is up, which does not end the episode; the next appears elsewhere. Success
-is to have reached them all. What is hard is that the target is gone at once: a policy has to
-notice, forget the old place and find the new one, which the arm may hide from both cameras.
+is to have reached them all. The difficulty is that the target vanishes at once: a policy has to
+notice this, forget the old place and find the new one, which the arm may hide from both cameras.
 """
 
 import dataclasses
@@ -109,13 +109,13 @@ class Sequence(Placing[SequenceSpec, SequenceScenario]):
     hard: ClassVar[Mapping[str, str]] = {
         "sequence-thesis": (
             "Each target vanishes when it was reached or when its time is up, and the next may "
-            "lie half around the base: five ways in a row have to succeed, from wherever the "
-            "arm stands."
+            "lie half a turn around the base: five ways in a row have to succeed, each from "
+            "wherever the arm is."
         ),
         "sequence-hard": (
-            "There is time for the way and for one look from above, not for two. The eye to "
-            "hand errs by up to ten centimetres on the table; what the first target shows of "
-            "this error would serve for the next four."
+            "There is time for the way and for one look from above, but not for two. The eye to "
+            "hand has an error of up to ten centimetres on the table; the first target shows "
+            "this error, and a policy could use it for the next four."
         ),
     }
 
@@ -160,7 +160,7 @@ class Sequence(Placing[SequenceSpec, SequenceScenario]):
             self.put_marker(physics, self._goal)
 
     def goal(self, ahead_s: float = 0.0) -> Goal:
-        """Over the present target; where the next one will be nobody knows."""
+        """Over the present target; the place of the next one is not known."""
         return self._goal
 
     def occupied(self) -> FloatArray:

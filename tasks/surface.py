@@ -1,4 +1,4 @@
-"""``surface``: place the flange over a mark on a panel whose slope and height have to be seen.
+"""``surface``: place the flange over a mark on a panel of unknown slope and height.
 
 A panel stands on the table, turned, tilted to any side and raised; a target is painted on it, and
 small marks in a ring around it. Errors are to the surface *there*: above its target, along its
@@ -7,9 +7,9 @@ fuselage's skin, a cylinder of some radius whose axis points anywhere, and the t
 its crown. Marks are separate and lie on the skin: a wide flat one would stand off it. In
 ``surface-hard`` there are seams and rivets, the light, colours and noise of the hard tasks.
 
-A centred disc tells a slope only by how round it looks: to the second order. A ring of marks tells
-it to the first: what leans towards the eye looks larger. Whoever comes near, or looks from several
-sides, sees it well enough (see the certificate).
+A centred disc shows a slope only by how round it looks, which is a second-order effect. A ring of
+marks shows it to first order, because what leans towards the eye looks larger. Pictures from near,
+or from several sides, show the slope well enough (see the certificate).
 
 Touching the panel ends the episode.
 """
@@ -111,17 +111,19 @@ class Surface(Placing[SurfaceSpec, SurfaceScenario]):
 
     hard: ClassVar[Mapping[str, str]] = {
         "surface-tilted": (
-            "Nobody tells how high the target lies, nor which way the panel leans: a place that "
-            "the eye to hand sees is off by centimetres, and the plane z = 0 means nothing."
+            "The height of the target and the slope of the panel are unknown: a place that the "
+            "eye to hand sees is wrong by centimetres if it is taken to lie in the plane z = 0."
         ),
         "surface-fuselage": (
-            "The skin is curved, and the marks on it are small: half a degree takes more than one "
-            "look, or one from near and straight above, where the tool has to be in the end."
+            "The skin is curved, and the marks on it are small: half a degree needs more than "
+            "one look, or one from near and straight above, where the tool has to be in the "
+            "end."
         ),
         "surface-hard": (
-            "At 50 mm, 0.25 mm sideways are 0.29 deg of the normal, told by six marks of 1.7 mm "
-            "on a ring of 17 mm: one look from the goal leaves degrees. It takes many, from well "
-            "to the side, and there is time for about thirty."
+            "At 50 mm, 0.25 mm sideways are 0.29 deg of the normal, and six marks of 1.7 mm on "
+            "a ring of 17 mm have to show it. One look from the goal leaves an error of "
+            "degrees. It takes many looks from well to the side, and there is time for about "
+            "thirty."
         ),
     }
 
@@ -195,7 +197,7 @@ class Surface(Placing[SurfaceSpec, SurfaceScenario]):
 
     @classmethod
     def certify(cls, env: "Environment", scenarios: Iterable[int]) -> list["Check"]:
-        """Reachable, in time and observable; slope and place told well enough by the marks."""
+        """Reachable, in time and observable; the marks show slope and place well enough."""
         from hvs_suite.tasks.shared import certificate
         from hvs_suite.tasks.shared.certificate_slope import check_slope
         from hvs_suite.tasks.shared.pattern_pose import Ring

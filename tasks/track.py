@@ -1,9 +1,9 @@
 """``track``: stay over a target that moves.
 
 A disc moves over the table, on a conveyor (a straight line at constant speed) or along a smooth
-curve that nobody can foresee. Episodes are always played to their time limit: what counts is to be
-inside the tolerances at the end of each of the last control steps. What is hard is that pictures
-show where the target was: the arm trails its set point, and a policy has to aim ahead.
+curve that cannot be predicted. Episodes are always played to their time limit: what counts is to be
+inside the tolerances at the end of each of the last control steps. The difficulty is that pictures
+show where the target was, and the arm trails its set point, so a policy has to aim ahead.
 """
 
 import dataclasses
@@ -134,16 +134,15 @@ class Track(Placing[TrackSpec, TrackScenario]):
     hard: ClassVar[Mapping[str, str]] = {
         "track-line": (
             "Pictures show where the target was, and the arm trails its set point: at 100 mm/s "
-            "a policy that aims at what it sees is ten millimetres late."
+            "a policy that aims at what it sees is ten millimetres behind."
         ),
         "track-curve": (
-            "Direction and speed change all the time, so that the past says less and less of "
-            "what comes; the arm has to aim ahead all the same."
+            "Direction and speed change all the time, so the past predicts the motion only for "
+            "a short time; the arm still has to aim ahead."
         ),
         "track-hard": (
-            "Commands act a step late, which nobody tells the policy: it has to know where the "
-            "target will be 0.2 s from now, to a millimetre, on a motion that cannot be "
-            "foreseen."
+            "Commands act a step late, and the policy is not told so: it has to predict to a "
+            "millimetre where the target will be 0.2 s from now, on an irregular motion."
         ),
     }
 
@@ -212,7 +211,7 @@ class Track(Placing[TrackSpec, TrackScenario]):
         return {"goal_velocity": self.goal().velocity}
 
     def at_reset(self) -> dict[str, float]:
-        """Nothing counts yet."""
+        """Before the first step there is nothing to measure."""
         return {WORST_POSITION: 0.0, WORST_TILT: 0.0, RMS_POSITION: 0.0, TIME_INSIDE: 0.0}
 
     def tally(

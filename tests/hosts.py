@@ -65,7 +65,7 @@ class Hosts:
             **os.environ,
             # Who plays on this machine alone tells Ray so, and whoever comes after in this process.
             "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "1",
-            # Who has no token is refused; each cluster has its own.
+            # Ray refuses clients without the token; each cluster has its own.
             "RAY_AUTH_MODE": "token",
             "RAY_AUTH_TOKEN": secrets.token_hex(32),
             "RAY_USAGE_STATS_ENABLED": "0",

@@ -43,7 +43,7 @@ def kalman(pace: float, jerk: float, noise_m: float) -> Predict:
 
 
 def gaussian_process(variance_m2: float, noise_m: float) -> Predict:
-    """The best linear predictor for who knows the family's spectrum, but not the motion."""
+    """The best linear predictor that knows the family's spectrum, but not the motion."""
     omega = 2.0 * np.pi * np.linspace(0.05, 0.45, 60)
     share = omega**-2 / np.sum(omega**-2)
 

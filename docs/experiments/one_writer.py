@@ -68,7 +68,7 @@ class Answer:
 
 
 def driver() -> None:
-    """Prints what a result costs who reads it, by its size."""
+    """Prints what reading a result costs, by its size."""
     from hvs_suite.executor import spread
     from hvs_suite.on_ray import RayCluster
 

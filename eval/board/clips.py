@@ -85,9 +85,9 @@ class _Order:
 def choose(result: Result) -> list[tuple[Kind, EpisodeRow]]:
     """Returns the typical success and the typical failure of a result, as far as it has them.
 
-    Typical is the middle one: of successes by steps, of failures by where they ended. The best
-    would flatter, the worst would slander. Clips are drawn from the action log, so it is the middle
-    one of the scenarios that it holds.
+    The typical one is the median: of successes by their steps, of failures by where they ended. The
+    best or the worst would mislead. Clips are drawn from the action log, so the median is taken
+    over the scenarios that it holds.
     """
     rows = result.episodes[: result.metadata.n_logged]
     headline = registry.find(result.summary.task).headline[0]

@@ -68,9 +68,9 @@ class Sheet:
         identity: Its name within the page.
         outcomes: Figures with their titles.
         films: Its clips; the page may have none.
-        landings: Where it lands, and what the picture shows; None where landings say nothing.
+        landings: Where it lands, and what the picture shows; None where landings have no meaning.
         errors: Title of each metric and its figures, as `ERRORS` heads them.
-        origin: What it was run on, with titles.
+        origin: Machine and versions that it was run on, with titles.
         command: How anyone can check it.
     """
 
@@ -114,9 +114,9 @@ def sheet(entry: Entry, films: Sequence[Film]) -> Sheet:
 
 
 def sideways(entry: Entry) -> float | None:
-    """Returns the task's tolerance in the target plane (mm); None where landings say nothing.
+    """Returns the task's tolerance in the target plane (mm); None where landings have no meaning.
 
-    They do where episodes are played to their end whatever comes: past the goal to the time limit.
+    They have one where episodes are always played past the goal to the time limit.
     """
     spec = registry.find(entry.result.summary.task)
     metric = spec.landing_metric

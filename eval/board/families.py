@@ -20,7 +20,7 @@ class Task:
     Attributes:
         name: Without version.
         identity: With it; its name within the page.
-        hard: What is hard about it; empty where its family does not say.
+        hard: What is hard about it; empty if its family does not tell.
         split: Of the results.
         entries: The best first.
         columns: Of its table.

@@ -126,7 +126,7 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def _plain(text: str) -> str:
-    """Returns text that Markdown takes for nothing but text."""
+    """Returns text in which Markdown finds no markup."""
     text = shown(text)
     for character in "\\|`<>[]*_":
         text = text.replace(character, f"&#{ord(character)};")

@@ -21,11 +21,11 @@ class Pair:
     """One policy against another.
 
     Attributes:
-        other: The policy that it is held against.
+        other: The policy that it is compared with.
         decided: Whether the first is ``better`` or ``worse``, or the scenarios cannot tell.
         points: Difference in success (percentage points), as people read it.
         p: The corrected p, as people read it.
-        counts: Who solves how many, in words.
+        counts: How many each of them solves, in words.
     """
 
     other: str

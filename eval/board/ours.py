@@ -1,8 +1,8 @@
-"""Names on the board that are ours, and the actions of the results that may bear them.
+"""Names on the board that are ours, and the actions of the results that may have them.
 
-``eval/ours.json`` holds the SHA-256 of the action log of each ``<policy>/<task>`` that
-the suite's own policies stand on the board with. A submission does not touch it. After they were
-scored anew, ``python -m hvs_suite.eval.board.ours`` writes it from ``eval/results``.
+``eval/ours.json`` holds the SHA-256 of the action log of each ``<policy>/<task>`` that the suite's
+own policies stand on the board with. A submission does not touch it. After they were scored again,
+``python -m hvs_suite.eval.board.ours`` writes it from ``eval/results``.
 """
 
 import json
@@ -19,14 +19,14 @@ FILE = Path(__file__).resolve().parents[1] / "ours.json"
 
 
 def check(path: Path, result: Result) -> None:
-    """Checks that a result bears a name of ours only where it is ours.
+    """Checks that a result has a name of ours only if it is ours.
 
     Args:
         path: ``<policy>/<task>.json``.
         result: What it holds.
 
     Raises:
-        ResultError: It bears one, or one that looks like it, with other actions.
+        ResultError: It has such a name, or one that looks like it, with other actions.
     """
     folder, summary = path.parent.name, result.summary
     for name in (folder, summary.policy):

@@ -1,4 +1,4 @@
-"""Draws the board as one web page: no network, sortable, readable on a phone and in the dark.
+"""Draws the board as one web page: offline, sortable, readable on a phone and in dark mode.
 
 Everything is in the file: style, script, plots and clips. The style and the script lie beside this
 module as ``page.css`` and ``page.js``. What the page says is in ``templates``, which escape every

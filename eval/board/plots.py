@@ -47,7 +47,7 @@ class Plot:
     """Curves of success.
 
     Attributes:
-        title: What it shows, for those who cannot see it.
+        title: What it shows, for readers who cannot see it.
         x_label: Axis and unit.
         x_ticks: Place and text of each.
         y_ticks: The same of success in percent.

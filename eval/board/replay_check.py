@@ -1,8 +1,8 @@
 """Which results were played again before they went on the board, and how many scenarios of each.
 
-Whoever builds the board finds that out by playing them. A ledger remembers it by each file's
-content, so that a build plays only what is new. It lies among the builder's own files, never among
-what is submitted: what comes with a result is a claim.
+The build of the board plays them. A ledger records this by each file's content, so that a build
+plays only new results. The ledger is one of the builder's own files, never a submitted file,
+because anyone could write what is submitted.
 """
 
 import hashlib

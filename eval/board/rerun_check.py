@@ -1,9 +1,9 @@
-r"""What the maintainers found when they ran a policy themselves, on a split that nobody had seen.
+r"""What the maintainers found when they ran a policy themselves, on a new split.
 
-Playing logged actions again proves what they did, not that the named policy chose them. Running the
-policy itself does: its weights, or its server, on scenarios that nobody could prepare for. Such
-results lie in a folder of the maintainers', as ``<policy>/<task>.json``, which no submission
-touches::
+Playing logged actions again proves what they did, but not that the named policy chose them. Running
+the policy itself proves that too: its weights or its server, on scenarios that were not known in
+advance. Such results lie in a folder of the maintainers', as ``<policy>/<task>.json``, which no
+submission touches::
 
     hvs evaluate --policy my/checkpoint --task align-easy --split <unseen> \
       --episodes 200 --out reruns/my-policy/align-easy.json
@@ -21,7 +21,7 @@ from hvs_suite.eval.scoring.verification import check_as_named, check_task
 
 
 def check(submissions: Sequence[Submission], folder: Path) -> dict[str, Result]:
-    """Reads the re-runs of results and holds the results against them.
+    """Reads the re-runs of results and compares the results with them.
 
     Args:
         submissions: Results of the board.

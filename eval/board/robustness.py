@@ -10,8 +10,8 @@ from hvs_suite.eval.scoring.robustness_file import ALL, Cell, Played, Robustness
 
 NOTE = (
     "One thing at a time differs from the task as named, at three strengths, and then all of them "
-    "at once; nobody tells the policy. Each figure is the success in percent on the same scenes as "
-    "undisturbed. A star marks what differs from there: McNemar's exact test with Holm's "
+    "at once; the policy is not told. Each figure is the success in percent on the same scenes as "
+    "undisturbed. A star marks a significant difference: McNemar's exact test with Holm's "
     f"correction, p below {SIGNIFICANT:g} for all cells of a policy and task together."
 )
 

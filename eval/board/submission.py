@@ -26,7 +26,7 @@ MOST_ALIKE = 0.25
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Submission:
-    """A result that wants to stand on the board.
+    """A result that is submitted to the board.
 
     Attributes:
         path: ``<results>/<policy>/<task>.json``.
@@ -43,13 +43,13 @@ class Submission:
 def check(
     results: Path, paths: Iterable[Path] | None = None, *, draft: bool = False
 ) -> list[Submission]:
-    """Holds results against the rules, and against everything that stands in the folder.
+    """Checks results against the rules, and against all other results in the folder.
 
     Args:
         results: Folder that holds ``<policy>/<task>.json``.
         paths: Those of them that are new or changed; all by default.
-        draft: Let pass what is no score yet: fewer scenarios, another split, metadata that lack
-            something, and results of the suite's own policies that somebody else made.
+        draft: Accept what is not a score yet: fewer scenarios, another split, incomplete metadata,
+            and results of the suite's own policies that other people made.
 
     Returns:
         The checked results by path; re-simulating them is `verification.verify`'s.
@@ -128,7 +128,7 @@ def _check_alone(path: Path, result: Result, results: Path, *, draft: bool) -> N
 
 
 def _check_passes_for_nobody(path: Path, folders: set[str]) -> None:
-    """Checks that a name in letters of another alphabet is not somebody else's to the eye.
+    """Checks that a name does not look like another one in letters of another alphabet.
 
     Raises:
         ResultError: It is.

@@ -12,8 +12,8 @@ NOTES = (
     ("success", "The share of scenarios solved, with its Wilson 95 % interval."),
     (
         "steps to goal",
-        "Their mean over the successes. Beside it stands how many times the expert's that is, on "
-        "the scenarios that both solve.",
+        "Their mean over the successes, and beside it the ratio to the expert's steps, on the "
+        "scenarios that both solve.",
     ),
     (
         "errors, forces, shares of time",
@@ -28,19 +28,19 @@ NOTES = (
     (
         "replayed",
         "The logged actions of so many scenarios, drawn after the result was handed in, were "
-        "played again and gave the same numbers. That the named policy chose them, and how fast, "
-        "is its submitter's word.",
+        "played again and gave the same numbers. Only the submitter vouches that the named policy "
+        "chose them, and how fast.",
     ),
     (
         "re-run",
-        "The maintainers ran the policy itself, its weights or its server, on scenarios that "
-        "nobody had seen, and reached a success that agrees.",
+        "The maintainers ran the policy itself (its weights or its server) on new scenarios, and "
+        "its success agreed with the result.",
     ),
 )
 """What the figures mean: term and explanation."""
 DRAFT = (
-    "This is a draft: results on it may hold fewer scenarios than a score takes, and nobody has "
-    "held them against the rules of the board."
+    "This is a draft: its results may have fewer scenarios than a score needs, and they were not "
+    "checked against the rules of the board."
 )
 DASH = "\N{EN DASH}"
 

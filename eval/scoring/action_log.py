@@ -1,4 +1,4 @@
-"""The action log beside a result: every action of every scenario, from which all else follows.
+"""The action log beside a result: all actions, from which everything else follows.
 
 ``<file stem>.actions.npz`` holds ``steps`` (n,) int64, the control steps played in scenarios
 0..n-1, and ``actions`` (sum of steps, 7) float32, scenario after scenario, as the policy gave them,
@@ -97,8 +97,9 @@ def executed(actions: Sequence[Actions], steps: int) -> Actions:
 def share_alike(one: Actions, other: Actions) -> float:
     """Returns in which share of the scenarios two policies did the same, in [0, 1].
 
-    The same are seven in ten of the steps that both played, each action to a ten-thousandth of its
-    range. Whoever copies changes some; where both go at full speed, any two good policies agree.
+    Two policies did the same if the actions agree to a ten-thousandth of their range in seven in
+    ten of the steps that both played. Not all steps, because a copy may have some changed; not
+    fewer, because any two good policies agree where both go at full speed.
 
     Args:
         one: As `executed` gives them, up to where each scenario was scored: what comes after it

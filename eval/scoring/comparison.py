@@ -1,4 +1,4 @@
-"""Two policies on the same scenarios: who is better, and how sure one can be of it."""
+"""Two policies on the same scenarios: which is better, and how certain that is."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -74,7 +74,7 @@ class Comparison:
     unverified: tuple[str, ...]
 
     def conclusion(self) -> str:
-        """Returns what may honestly be said, in one sentence."""
+        """Returns the conclusion that the figures allow, in one sentence."""
         rates = (
             f"{self.a} solves {self.n_both + self.n_only_a} and {self.b} "
             f"{self.n_both + self.n_only_b} of the same {self.n} scenarios of {self.task}"

@@ -1,4 +1,4 @@
-"""Who is scored, found by name.
+"""The policy to be scored, found by name.
 
 Light to import: a policy's own process starts with this, and holds nothing of the simulator.
 """
@@ -23,7 +23,7 @@ BLIND = ("expert", "zero", "random")
 
 @dataclasses.dataclass(frozen=True)
 class Contender:
-    """Who is scored, and what the result says of it.
+    """The policy to be scored, and what the result says of it.
 
     Attributes:
         name: As shown in the result.
@@ -60,7 +60,7 @@ def find(policy: str, task: str, options: Mapping[str, Any] = AS_NAMED) -> Conte
         PolicyError: There is no such policy, or it does not fit the task.
     """
     make = policy_factory(policy, task, options)
-    # An absolute path would tell who ran it and where.
+    # An absolute path would reveal the user and the machine.
     name = Path(policy).name if Path(policy).is_absolute() else policy
     if isinstance(make, ImportedFactory):
         source = make.source()
@@ -88,16 +88,16 @@ def find(policy: str, task: str, options: Mapping[str, Any] = AS_NAMED) -> Conte
 
 
 def check_public(policy: str) -> None:
-    """Checks that a policy makes do with what a task shows.
+    """Checks that a policy needs only the observations of a task.
 
     Args:
         policy: As `policy_factory` takes it.
 
     Raises:
-        PolicyError: It looks behind the observations.
+        PolicyError: It needs more than the observations.
     """
     if policy in PRIVILEGED:
         raise PolicyError(
-            f"{policy} looks behind the observations, which do not travel; evaluate it without a "
-            "server"
+            f"{policy} needs more than the observations, which are all that a server gets; "
+            "evaluate it without one"
         )

@@ -1,4 +1,4 @@
-"""Takes the ``eval_info.json`` of ``lerobot-eval`` in, as what it is: a claim without proof.
+"""Imports the ``eval_info.json`` of ``lerobot-eval``, marked as unverified.
 
 Such a file names neither policy nor scenarios and logs no actions. It is kept with its
 successes under the same keys as ours, marked ``"verified": false``; it can be compared with others
@@ -180,7 +180,7 @@ def read(
     Args:
         path: The file.
         task: Named task that was evaluated; where the file holds several, that one of them.
-        policy: Name for the policy; the file does not say.
+        policy: Name for the policy; the file does not contain it.
         split: Split that was played.
         seed: First seed; the environment plays scenario seed (mod 1,000 on ``test``).
 

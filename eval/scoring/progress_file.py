@@ -1,8 +1,8 @@
-"""What an interrupted evaluation leaves behind, so that the same command goes on.
+"""What an interrupted evaluation leaves, so that the same command can continue.
 
 ``<file>.partial`` beside the result holds one JSON line that says what is being evaluated, then a
 line for each scenario as it ends. Each line is appended by a single write, so a kill or a full disk
-can tear at most the last one, which is then played again. Whoever writes holds the file's lock.
+can tear at most the last one, which is then played again. The writer holds the file's lock.
 """
 
 import base64
@@ -85,7 +85,7 @@ class ProgressFile:
             elapsed_s: Wall time up to now, over all sittings (s).
 
         Raises:
-            OutputError: The disk is full, say.
+            OutputError: The file cannot be written, such as when the disk is full.
         """
         if self._descriptor is not None:
             lines: list[dict[str, Any]] = [] if self.trials else [self._head()]

@@ -16,7 +16,7 @@ from hvs_suite.errors import PolicyError
 from hvs_suite.policies.checkpoints.files import MOST_SETTINGS_BYTES, home, read_shapes
 from hvs_suite.reading import read_bytes
 
-# Whatever can change a physics state, a picture, or a policy's answer to it.
+# Packages that can change a physics state, a picture, or a policy's action.
 PACKAGES = (
     "mujoco",
     "dm-control",
@@ -56,7 +56,7 @@ def gl_renderer() -> str:
     """
     context = gl.create_context(8, 8)
     try:
-        # Only now: PyOpenGL settles on a platform when it is imported, the context chooses it.
+        # Only now: PyOpenGL fixes its platform when it is imported, and the context chooses it.
         import OpenGL.GL
 
         name: bytes = OpenGL.GL.glGetString(OpenGL.GL.GL_RENDERER)

@@ -274,7 +274,7 @@ class Summary(_Block):
         pc_success: Success rate (percent).
         pc_success_ci95: Wilson 95 % interval of the success rate (percent).
         n_collision: Episodes that ended in a collision.
-        n_failure: Episodes that the policy lost by its own fault.
+        n_failure: Episodes that the policy lost by a failure of its own.
         failures: How many for each reason.
         n_clipped: Control steps, over all episodes, whose action was out of range.
         steps_to_goal_mean: Mean over successes; None if there is none.
@@ -356,7 +356,7 @@ class Metadata(_Block):
         tolerances: Bound of each metric that decides success, in the metric's unit.
         time_limit_steps: The task's time limit (control steps).
         options: Options that differ from the named task's; empty for a score.
-        policy_kind: ``builtin``, ``checkpoint``, ``module`` (a person's own code) or ``server``.
+        policy_kind: ``builtin``, ``checkpoint``, ``module`` (code of one's own) or ``server``.
         policy_hash: SHA-256 over the checkpoint's files, or of the module's; a server's own word;
             None for a policy that comes with the suite.
         policy_parameters: Numbers in the checkpoint's weights; None if it has none.
@@ -546,8 +546,8 @@ def _text(columns: Mapping[str, Any], indent: str) -> str:
 def seal(content: Mapping[str, Any]) -> str:
     """Returns the SHA-256 over the blocks of a file: keys sorted, no spaces, version and seal out.
 
-    It tells a slip of an editor, or half a merge, from a result; who means to cheat can compute it
-    anew, and is found by re-simulation.
+    It detects accidental changes, such as by an editor or half a merge. A cheat can compute it
+    again; re-simulation finds that.
     """
     blocks = {k: v for k, v in content.items() if k not in ("schema_version", "sha256")}
     text = json.dumps(blocks, sort_keys=True, separators=(",", ":"), allow_nan=False)
@@ -562,6 +562,8 @@ def load(path: Path) -> Result:
     """
     content = reading.read_object(path, error=ResultError, most=MOST_BYTES)
     version = content.get("schema_version")
+    if version is None:
+        raise ResultError(f"{path}: is no result of 'hvs evaluate' (it has no schema_version)")
     if version != SCHEMA_VERSION:
         raise ResultError(
             f"{path}: schema_version is {version!r:.50}, but this hvs_suite reads "

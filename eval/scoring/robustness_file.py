@@ -27,7 +27,7 @@ Count = Annotated[int, pydantic.Field(ge=0)]
 
 
 class _Block(pydantic.BaseModel):
-    """Unknown keys are refused: a slip of an editor shall not pass for a figure."""
+    """Unknown keys are refused, so that a typing error is not taken for a figure."""
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
 

@@ -1,8 +1,8 @@
 """One scenario played for a score: to the goal, and on past it to where the policy settles.
 
-One playing serves both figures. The score is taken at the control step at which the goal has been
-held; the policy, which is not told, plays on to the time limit. Up to the goal the two passes that
-this replaces would be the same episode anyway, since a scenario fixes everything that is random.
+One episode gives both sets of figures. The score is taken at the control step at which the goal has
+been held; the policy, which is not told, plays on to the time limit. Two separate episodes would be
+the same up to the goal, because a scenario fixes everything random.
 """
 
 import abc
@@ -35,7 +35,7 @@ DECISION_LIMIT_S = 10.0
 LONGEST_DECISION_LIMIT_S = 3600.0
 # A policy in another process keeps the time itself; this much later the alarm goes off anyway (s).
 _GRACE_S = 5.0
-# A nanometre: enough digits for any judgement, few enough to read.
+# A nanometre: precise enough for any comparison, and short to read.
 _DIGITS = 6
 
 Decide = Callable[[Observation], Action]
@@ -73,7 +73,7 @@ class EpisodeLostError(Exception):
 
     Args:
         reason: What is counted.
-        detail: What it said, for whoever wants to mend it.
+        detail: What it said, which helps to find the fault.
     """
 
     def __init__(self, reason: str, detail: str = "") -> None:
@@ -86,7 +86,7 @@ class Connected(abc.ABC):
     """A policy in another process, to which a connection is made before the clock starts.
 
     `Policy.select_action` and `Policy.reset` of such a policy keep the time limit of a decision by
-    themselves; they and nobody else's raise `EpisodeLostError`.
+    themselves; only they may raise `EpisodeLostError`.
     """
 
     @abc.abstractmethod
@@ -97,7 +97,7 @@ class Connected(abc.ABC):
             seed: What the policy is told at the next reset; it may draw from it.
 
         Raises:
-            ServerError: There is nobody at the other end. The run stops, and resumes.
+            ServerError: Nothing answers at the other end. The run stops, and can be resumed.
             PolicyError: The policy cannot be built there.
         """
 
@@ -368,7 +368,7 @@ def _alarm_clock() -> Iterator[Callable[[float], object]]:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, handler)
         if before:
-            # Somebody else's timer (a test runner's) goes on as if we had not been here.
+            # A timer that was running before (of a test runner) continues.
             left = max(before - (time.monotonic() - started), 1e-3)
             signal.setitimer(signal.ITIMER_REAL, left)
 

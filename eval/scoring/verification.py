@@ -1,7 +1,7 @@
 """Plays a result's logged actions again, without pictures, and recomputes every number.
 
-What the actions did is thereby proven; that a certain policy chose them is not, and versions of
-packages are believed. A policy's failures (NaN, too slow) are believed too: they only ever cost it
+This proves what the actions did. It does not prove which policy chose them, nor the versions of
+packages. A policy's failures (NaN, too slow) are not checked either, because they can only cost it
 an episode.
 """
 
@@ -135,8 +135,8 @@ def verify(
     Args:
         path: The result; its action log stands beside it.
         sample: Scenarios to play again; None plays all.
-        nonce: What the sample is drawn with, to repeat a draw; a new one by default, since whoever
-            made the file must not know it.
+        nonce: What the sample is drawn with, to repeat a draw; a new one by default, because the
+            author of the file must not know it.
         workers: Processes that share the work, or others elsewhere.
         progress: Called after each scenario.
 
@@ -179,7 +179,7 @@ def verify(
     if n_near > most:
         raise ResultError(
             f"{path}: rounding would have decided {n_near} of {len(chosen)} outcomes as the file "
-            f"says; more than {most} is no chance"
+            f"says; more than {most} cannot be chance"
         )
     return Verdict(len(rows), len(chosen), n_near, nonce, largest)
 
@@ -294,7 +294,7 @@ def load_actions(path: Path, result: Result) -> list[action_log.Actions]:
 
 
 def new_nonce() -> str:
-    """Returns what a sample can be drawn with and nobody could know before: 32 hex digits."""
+    """Returns a random nonce to draw a sample with: 32 hex digits."""
     return secrets.token_hex(16)
 
 

@@ -1,8 +1,8 @@
-"""A policy in a process of its own on this machine: a person's code plays where no simulator is.
+"""A policy in a process of its own on this machine, without a simulator in it.
 
-Python hides nothing from code in the same process: the garbage collector lists every environment,
-and a frame's caller knows which scenario it plays. So a person's code gets a process that holds
-neither. The conversation is that of a policy server, over a socket.
+Python cannot hide anything from code in the same process: the garbage collector lists every
+environment, and a frame's caller knows which scenario it plays. So code of one's own gets a process
+that holds neither. It speaks the protocol of a policy server, over a socket.
 """
 
 import contextlib
@@ -40,18 +40,20 @@ class PolicyProcess:
         ours, theirs = socket.socketpair()
         with theirs:
             self._process = subprocess.Popen(
-                # -P: only once everything of ours is imported comes the working folder first.
+                # -P: the working folder comes first only after all modules of the suite are
+                # imported.
                 [
                     *(sys.executable, "-P", "-u", "-m", policy_session.__name__),
                     *(policy, str(theirs.fileno())),
                 ],
                 stdin=subprocess.DEVNULL,
-                # What a policy prints is no output of ours.
+                # What a policy prints is not output of the command.
                 stdout=_STDERR,
                 pass_fds=[theirs.fileno()],
                 cwd=place,
                 env={**os.environ, **WORKER_ENVIRONMENT, "PYTHONPATH": os.pathsep.join(sys.path)},
-                # Ctrl-C is for whoever evaluates; and what the policy starts ends with it.
+                # Ctrl-C is for the evaluating process; processes that the policy starts end with
+                # it.
                 start_new_session=True,
             )
         self._connection = Connection(ours.detach())

@@ -28,7 +28,7 @@ MAX_CONNECTIONS = 32
 """Each has a process with a policy of its own."""
 HANDSHAKE_LIMIT_S = 10.0
 """For the WebSocket's opening, and again for the first message, which starts a process (s)."""
-# How often a server that waits for its policy looks whether anybody still wants the answer.
+# How often a server that waits for its policy checks that the connection still exists.
 _LOOK_PERIOD_S = 0.2
 
 
@@ -52,7 +52,7 @@ class _Handler:
             websocket.close(CloseCode.TRY_AGAIN_LATER, f"{MAX_CONNECTIONS} others are playing")
             return
         try:
-            # Whoever is at fault, the connection ends, and the evaluation sees that.
+            # Whichever side is at fault, the connection ends, and the evaluation sees that.
             with contextlib.suppress(ConnectionClosed, OSError):
                 self._play(websocket)
         finally:
@@ -79,7 +79,7 @@ def _look(process: PolicyProcess) -> bytes | None:
 
 @dataclasses.dataclass(frozen=True)
 class _Doorkeeper:
-    """Turns away whoever was sent here by somebody else's web page.
+    """Refuses requests that a web page sent.
 
     A browser lets any page connect to any address, and says so in ``Origin``; a name that points to
     this machine only for a while shows in ``Host``. Evaluations send no ``Origin``.
@@ -135,7 +135,7 @@ def listening(policy: str, host: str, port: int) -> Iterator[tuple[Server, str]]
             process_request=_Doorkeeper(host),
             open_timeout=HANDSHAKE_LIMIT_S,
             max_size=wire.MAX_MESSAGE_BYTES,
-            # One message, one answer: whoever sends more waits.
+            # One message, one answer: a client that sends more has to wait.
             max_queue=1,
             close_timeout=1.0,
         )

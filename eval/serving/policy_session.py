@@ -25,7 +25,7 @@ from hvs_suite.registry import find
 from hvs_suite.rollout import Instructed, Policy, library_seeds, one_torch_thread
 from hvs_suite.tasks.shared import lock
 
-# Well below what an answer may hold, and more than anybody reads.
+# Well below what an answer may hold, and longer than a reader needs.
 _LONGEST_WORDS = 1000
 _LONGEST_NAME = 100
 
@@ -68,7 +68,7 @@ class Session:
             self._policy = player.make(context)
         except HvsError:
             raise
-        except BaseException as error:  # other people's code raises anything
+        except BaseException as error:  # code outside the suite may raise anything
             raise PolicyError(f"{self._name} cannot be built: {describe(error)}") from error
         return {
             "type": "welcome",
@@ -165,7 +165,7 @@ def _guarded(call: Callable[[], Any], report: Callable[[Any], wire.Message]) -> 
 
 
 def _action(answer: Any) -> wire.Message:
-    """The message that carries a policy's answer; whether it is any good is judged elsewhere."""
+    """The message that carries a policy's answer; whether it is valid is checked elsewhere."""
     try:
         return {"type": "action", "action": np.array(answer, dtype=np.float32)}
     except Exception:  # the array may be one of the policy's own making
@@ -178,7 +178,7 @@ def _line(text: str) -> str:
 
 
 def main() -> None:
-    """Answers what comes over the socket, until nobody is at its other end."""
+    """Answers what comes over the socket, until the other end is closed."""
     policy, descriptor = sys.argv[1:]
     del sys.argv[1:]
     connection = Connection(int(descriptor))
@@ -191,7 +191,7 @@ def main() -> None:
 
 
 def _listen(connection: Connection, messages: "queue.SimpleQueue[bytes]") -> None:
-    """Ends the process with the other end, whatever the policy is at."""
+    """Ends the process when the other end closes, whatever the policy is doing."""
     try:
         while True:
             messages.put(connection.recv_bytes(wire.MAX_MESSAGE_BYTES))

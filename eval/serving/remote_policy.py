@@ -1,8 +1,8 @@
 """A policy in another process or on another machine, as an evaluation plays it.
 
-What goes wrong at the other end loses the episode in which it does, and is counted: no answer in
-time, no action, a connection that breaks. Before the next episode the connection is made anew;
-where nobody is there any more, the run stops, and resumes when the server is back.
+A fault at the other end loses the episode in which it happens, and is counted: no answer in time,
+no valid action, a broken connection. Before the next episode the connection is made again; if the
+server is gone, the run stops, and can be resumed when the server is back.
 """
 
 import abc
@@ -60,7 +60,7 @@ class Line(Protocol):
         """Returns the next message; raises as `send` does, or `TimeoutError` after seconds."""
 
     def close(self) -> object:
-        """Breaks the line off; does no harm twice."""
+        """Closes the line; calling it again does nothing."""
 
 
 def _printable(text: str) -> str:
@@ -123,7 +123,7 @@ class RemotePolicy(Connected):
         """Makes a line to the other end.
 
         Raises:
-            ServerError: There is nobody.
+            ServerError: Nothing answers.
         """
 
     @abc.abstractmethod
@@ -144,7 +144,7 @@ class RemotePolicy(Connected):
         if self._line is not None:
             return
         line = self._open()
-        # A line's own thread or process would keep it open when nobody plays it any more.
+        # A line's own thread or process would keep it open when the policy is no longer used.
         closing = weakref.finalize(self, _close, line)
         try:
             self.welcome = self._greet(line)
@@ -300,7 +300,8 @@ class _WebSocket:
                 # Servers may be too busy deciding to answer a ping; decisions have a limit.
                 ping_interval=None,
                 max_size=wire.MAX_ANSWER_BYTES,
-                # One answer a message; whoever sends more waits until it is asked.
+                # One answer to each message; a server that sends more has to wait until it is
+                # asked.
                 max_queue=1,
             )
             self._connection: ClientConnection = self._closing.enter_context(opening)
@@ -327,7 +328,7 @@ def find(
     decision_limit_s: float = DECISION_LIMIT_S,
     options: Mapping[str, Any] = AS_NAMED,
 ) -> Contender:
-    """Asks a server who it is.
+    """Asks a server for its name.
 
     Args:
         url: Of the server, ``ws://host:port``.
@@ -397,7 +398,7 @@ def _describe(spec: Any) -> dict[str, Any]:
 
 
 def _words(said: object) -> str:
-    """A line of what the other end said, or of an error; not more than anybody would read."""
+    """A line of what the other end said, or of an error, shortened for a reader."""
     return " ".join(str(said).split())[:_LONGEST_WORDS] or type(said).__name__
 
 

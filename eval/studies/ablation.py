@@ -1,4 +1,4 @@
-"""What each choice of the `hvs` policy buys: trained without it, judged on the same scenarios.
+"""What each choice of the `hvs` policy contributes: trained without it, on the same scenarios.
 
 Every policy has the same data, seed and number of optimiser steps as the whole one, but for the one
 thing that its row names. All lie in one folder, a sub-folder each; what is finished there is not
@@ -272,6 +272,6 @@ def draw(study: Study) -> Any:
         axes.text(row.ci95[1] + 1.5, place, f"{rate:.1f} %", va="center", fontsize=8)
     axes.set(xlim=(0.0, 112.0), xticks=range(0, 101, 20))
     axes.set_xlabel("solved (%), with Wilson's 95 % interval")
-    axes.set_title(f"{study.task}: what each choice buys", fontsize=10, loc="left")
+    axes.set_title(f"{study.task}: what each choice contributes", fontsize=10, loc="left")
     axes.spines[["top", "right"]].set_visible(False)
     return figure

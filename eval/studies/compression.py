@@ -189,7 +189,7 @@ class _Original:
         return reader.read_pictures(self.root, self._info, place, table, image_key(camera))
 
     def figures(self, folder: Path, report: Report) -> dict[str, CameraFigures]:
-        """Size and localisation of the lossless pictures; the others are held against these."""
+        """Size and localisation of the lossless pictures; the others are compared with these."""
         # What an earlier sitting found, (cameras, frames, 2) px.
         file = folder / "centres.npy"
         kept = np.load(file) if file.exists() else None

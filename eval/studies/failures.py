@@ -1,7 +1,8 @@
 """Why a policy fails: every lost scenario of a result, played again and sorted by its cause.
 
-The causes call for different cures. What was never seen wants looking; what was seen but misplaced
-wants a better eye; what was placed well and yet not reached wants better control, or more haste.
+The causes need different remedies. A target that was never seen needs better looking, one that was
+seen but misplaced needs a better eye, and one that was placed well but not reached needs better
+control or more speed.
 """
 
 import contextlib

@@ -27,7 +27,7 @@ from hvs_suite.rollout import one_torch_thread
 BASE = "base"
 FINETUNED, IMITATED, SCRATCH = "RL fine-tuning", "more imitation", "RL from scratch"
 EVAL_EPISODES = 100
-"""Scenes of an evaluation amid RL, at most."""
+"""Largest number of scenes of an evaluation during RL."""
 WEAK_BASE: Mapping[str, Any] = {
     "updates": 40,
     "warm_up_steps": 1_000,
@@ -458,7 +458,7 @@ def _minutes(training: Path) -> float:
 
 
 def _evaluated(training: Path, played_before: int) -> list[Point]:
-    """What an RL run was worth amid its training, its end left out."""
+    """Success of an RL run during its training, without its end."""
     rows = json.loads((training / "evaluations.json").read_text())[:-1]
     return [
         Point(

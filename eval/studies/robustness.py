@@ -150,7 +150,7 @@ class _Player:
 
     Attributes:
         plan: What is to be played.
-        contender: Who plays.
+        contender: The policy.
         out: Folder of the study.
         report: Called as the work goes on.
         cells: How many there are.

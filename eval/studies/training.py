@@ -20,7 +20,7 @@ Note = Callable[[Any], None]
 
 SPLIT = "dev"
 GIGABYTES = ("cache", "dagger", "replay", "eyes/*/frames")
-"""Folders of a training that nobody asks for again, as patterns."""
+"""Folders of a training that are not needed again, as patterns."""
 
 
 def train_and_judge(

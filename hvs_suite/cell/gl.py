@@ -145,7 +145,8 @@ def free_at_exit(free: "weakref.finalize[..., Any]") -> None:
     """Have a context freed before the interpreter's exit takes the graphics library down.
 
     Exit handlers run in reverse: MuJoCo registers its own while a context is first created, so one
-    that is registered after that runs in time. Contexts left alive end in noise on the terminal.
+    that is registered after that runs in time. Contexts that are left alive print errors on the
+    terminal.
 
     Args:
         free: Frees the context when it is called or its owner is collected.

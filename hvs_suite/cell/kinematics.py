@@ -192,9 +192,9 @@ class Kinematics:
     def _with_domes(self) -> tuple[pin.GeometryModel, list[bool]]:
         """The same scene, faster to measure, and which of its pairs hold the true bodies.
 
-        Coal measures capsules by a formula and cylinders by iterating, at ten times the price. So
-        cylinders of links get domes: a capsule holds its cylinder, hence is no farther from
-        anything. Link 7 keeps its shape against link 4, which is nearest to it as a rule.
+        Coal measures capsules by a formula and cylinders by iterating, which takes ten times as
+        long. So cylinders of links get domes: a capsule holds its cylinder, hence is no farther
+        from anything. Link 7 keeps its shape against link 4, which is nearest to it as a rule.
         """
         domed = self._scene.copy()
         domed.removeAllCollisionPairs()
@@ -326,7 +326,7 @@ class Kinematics:
     ) -> FloatArray:
         """The redundant family of a goal: every yaw with every elbow place, in all shapes.
 
-        Yaw turns A7 alone. Who only wants the fastest way takes
+        Yaw turns A7 alone. For the fastest way alone, use
         :meth:`goal_configurations_at_tool_angle`, which needs no grid of yaws.
 
         Args:

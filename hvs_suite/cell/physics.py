@@ -1,4 +1,4 @@
-"""dm_control's physics, whose own pictures are right whatever else draws in the process."""
+"""dm_control's physics, with correct pictures even if other renderers are in the process."""
 
 from typing import Any
 
@@ -13,8 +13,8 @@ class Physics(mjcf.Physics):
 
     @property
     def contexts(self) -> Any:
-        """What dm_control draws with; whoever asks is about to draw, or to free it."""
-        # mujoco.Renderer makes its own context current, and none when it closes, and tells nobody.
+        """dm_control's renderer; a caller is about to draw, or to free it."""
+        # mujoco.Renderer makes its own context current, and none when it closes, without notice.
         gl.strike_dm_control_off()
         return super().contexts
 

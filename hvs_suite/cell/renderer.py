@@ -223,8 +223,8 @@ def offscreen_context(
     """
     size, quality = model.vis.global_, model.vis.quality
     kept = size.offwidth, size.offheight, quality.offsamples, quality.shadowsize
-    # MjrContext reads these from the model when it is made, and never after. Whoever else draws the
-    # model (dm_control, mujoco.Renderer) is to find the sizes that it was compiled with.
+    # MjrContext reads these from the model only when it is made. Other renderers of the model
+    # (dm_control, mujoco.Renderer) must find the sizes that it was compiled with.
     try:
         size.offwidth = size.offheight = max_side
         quality.offsamples, quality.shadowsize = multisampling, shadow_size

@@ -109,8 +109,8 @@ class _Link:
     capsules: tuple[_Capsule, ...]
 
 
-# Nobody publishes centres of mass and inertias: these are those of the shells as solids of uniform
-# density, scaled to the published mass (shells.solid_inertia; a test holds the two together).
+# Centres of mass and inertias are not published. These are those of the shells as solids of uniform
+# density, scaled to the published mass (shells.solid_inertia; a test compares the two).
 _LINKS: tuple[_Link, ...] = (
     _Link(
         4.856,

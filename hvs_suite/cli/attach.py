@@ -1,4 +1,4 @@
-"""``hvs attach``: gives a dataset that LeRobot's tools edited its origin back."""
+"""``hvs attach``: restores the origin of a dataset that LeRobot's tools edited."""
 
 import dataclasses
 from pathlib import Path
@@ -11,10 +11,10 @@ from hvs_suite.cli import console
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Attach:
-    """Tell a dataset that lerobot-edit-dataset split, merged or trimmed where it comes from.
+    """Restore hvs.json in a dataset that lerobot-edit-dataset split, merged or trimmed.
 
-    Plays every episode again, without pictures, and writes hvs.json only if all of them are what
-    the origins say; then hvs check, pretrain, replay and share take the dataset.
+    Plays every episode again, without pictures, and writes hvs.json only if all of them agree with
+    the origins. Then hvs check, pretrain, replay and share accept the dataset.
 
     Attributes:
         data: Root folder of the edited dataset.

@@ -11,7 +11,7 @@ class Bench:
     """Measure how fast a task steps on this machine.
 
     Environment and bare loop take turns, episode by episode, in one thread of one process, so that
-    whatever else the machine does slows both alike.
+    other programs on the machine slow both equally.
 
     Attributes:
         task: A named task, such as align-easy; align-thesis with --expert, --recording or --ray.

@@ -21,10 +21,10 @@ FAILED = 1
 class Certify:
     """Certify named tasks over all their test scenarios, and write them into the version lock.
 
-    For maintainers, after changing what a task means and raising its version. Refuses a task that
-    means something else than the lock says at the same version. Where a check does not hold,
-    nothing of that task is written, and the exit code is 1. Of tasks that another package
-    registers, and of those that options change, the certificate is only printed.
+    For maintainers, after changing the meaning of a task and raising its version. Refuses a task
+    whose meaning differs from the lock at the same version. If a check does not hold, nothing is
+    written for that task, and the exit code is 1. For tasks of other packages, and for tasks
+    changed by options, the certificate is only printed.
 
     Attributes:
         tasks: Named tasks; all of the suite's own by default. Entries of other tasks stay as they
@@ -52,7 +52,7 @@ class Certify:
             raise OptionError(f"--workers must be at least 1, not {self.workers}")
         asked = self.tasks or filter(lock.is_own, hvs_suite.TASKS)
         options = {task: find(task).options_from_text(self.option) for task in asked}
-        # All are held against the lock first: certifying takes minutes a task.
+        # All are compared with the lock first, because certifying takes minutes a task.
         entries: dict[str, lock.LockEntry | None] = {}
         for task in options:
             entries[task] = None

@@ -14,10 +14,10 @@ DAMAGED = 1
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Check(Players):
-    """Check a dataset: decode every frame, hold the numbers together, play it all again.
+    """Check a dataset: decode every frame, compare the numbers, and play every episode again.
 
-    Each damaged place is one line: file, episode, frame and what is wrong. Exits with 1 if there is
-    any.
+    Prints one line for each damaged place: file, episode, frame and what is wrong. Exits with 1 if
+    there is any.
 
     Attributes:
         data: Root folder of the dataset.

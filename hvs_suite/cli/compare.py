@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Compare:
-    """Compare two results on the scenarios that both played, and say what may be concluded.
+    """Compare two results on the scenarios that both played, and say whether one is better.
 
     Attributes:
         first: Result file of policy A.

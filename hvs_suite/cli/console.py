@@ -46,7 +46,7 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], title: st
     from rich.table import Table
     from rich.text import Text
 
-    # As text, not as markup: cells and titles hold names that strangers gave.
+    # As text, not as markup, because cells and titles hold names from other people.
     table = Table(
         title=Text(shown(title)) if title else None,
         title_justify="left",

@@ -16,7 +16,7 @@ PARTS = ("dataset", "policy", "results", "board", "episode.gif")
 class Demo:
     """Record demonstrations, train a policy on them, score it, build a board, film an episode.
 
-    Everything is real and small; a longer training gives a better policy (see hvs pretrain).
+    All steps are real but small; longer training gives a better policy (see hvs pretrain).
 
     Attributes:
         out: Folder for everything the demo makes.

@@ -1,4 +1,4 @@
-"""``hvs doctor``: what works on this machine, what does not, and which package mends it."""
+"""``hvs doctor``: what works on this machine, what does not, and which package is missing."""
 
 import concurrent.futures
 import ctypes.util
@@ -53,7 +53,7 @@ class Probe:
     Attributes:
         works: It did its job in a process of its own.
         detail: The driver or version where it works, the reason where it does not.
-        remedy: How to mend it; empty where it works.
+        remedy: How to fix it; empty if it works.
     """
 
     works: bool
@@ -106,7 +106,7 @@ class Doctor:
         if working:
             print(f"{in_use} ({why}) cannot render here, but MUJOCO_GL={working[0]} can.")
         else:
-            print("Nothing renders here. Mend: apt-get install libegl1 libgl1-mesa-dri")
+            print("Nothing renders here. Fix: apt-get install libegl1 libgl1-mesa-dri")
         return FAILED
 
 
@@ -198,7 +198,7 @@ def _print_probes(what: str, probes: dict[str, Probe], in_use: str = "") -> None
     from rich.table import Table
 
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for column in (what, "", "found", "mend"):
+    for column in (what, "", "found", "fix"):
         table.add_column(column)
     for name, probe in probes.items():
         state = "works" if probe.works else "no"

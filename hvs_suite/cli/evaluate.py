@@ -24,8 +24,8 @@ MAX_COMPLAINTS = 3
 class Evaluate(Players):
     """Score a policy on scenarios 0 to N-1 of a split and write every episode to a result file.
 
-    Interrupted, the same command goes on. A policy that raises, answers nonsense or is too slow
-    loses that episode, and the reason is counted; so does one whose server breaks off.
+    If it was interrupted, the same command continues. A policy loses an episode in which it raises,
+    gives an invalid action, is too slow, or its server disconnects; the reason is counted.
 
     Attributes:
         task: Named task, such as align-thesis; give it several times for several tasks.
@@ -39,7 +39,7 @@ class Evaluate(Players):
         decision_limit: Time after which a decision loses its episode (s).
         server: Address of a policy server, such as ws://127.0.0.1:8765; 'hvs serve' starts one.
         option: Parameter of the task to change for a study, such as target_diameter_m=0.03; give it
-            several times for several. The result says so, and is no score then.
+            several times for several. The result then records this and is not a score.
     """
 
     task: tuple[str, ...]

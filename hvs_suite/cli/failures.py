@@ -15,10 +15,10 @@ from hvs_suite.errors import OptionError
 class Failures:
     """Sort a policy's lost scenarios by cause: not seen, misplaced, controlled badly, and so on.
 
-    The logged actions are played again; an hvs policy is asked where it took the target to be.
+    Plays the logged actions again, and asks an hvs policy where it estimated the target.
 
     Attributes:
-        results: Result files of hvs evaluate, their action logs beside them.
+        results: Result files of hvs evaluate, with their action logs beside them.
         policy: Checkpoint folder of the hvs policy that made them, or pretrained or finetuned;
             without it nothing counts as misplaced, and no pictures are drawn.
         out: Folder for failures.md and the pictures; by default the table is only printed.

@@ -11,12 +11,12 @@ import tyro
 class Fetch:
     """Unpack an archive of 'hvs share' into a new folder, and check every file's checksum.
 
-    An archive that holds anything but plain files below the folder is refused, and nothing is left.
+    An archive with anything but plain files below the folder is refused, and nothing is written.
 
     Attributes:
         archive: Archive to unpack (.tar or .tar.gz).
         out: Folder to make; must not exist or be empty.
-        sha256: The archive's own checksum, as 'hvs share' printed it, to be held against.
+        sha256: Checksum that the archive must have, as 'hvs share' printed it.
     """
 
     archive: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="ARCHIVE")]

@@ -14,10 +14,10 @@ class Finetune:
     """Fine-tune a pretrained policy by reinforcement learning.
 
     Lets the policy play and trains its eyes on what it saw, then learns by TD3 what to add to its
-    actions. No expert is asked. Trains for --minutes or --steps, whichever ends first, or for forty
-    minutes if neither is given; ends early if success falls, and keeps what was evaluated best.
-    Interrupted, it goes on from its last checkpoint when the same command is given again. Curves
-    and a film of each evaluation are in OUT/training.
+    actions. It needs no expert. Trains for --minutes or --steps, whichever ends first, or for forty
+    minutes if neither is given; ends early if success falls, and keeps what was evaluated best. If
+    it was interrupted, the same command continues from the last checkpoint. Curves and a film of
+    each evaluation are in OUT/training.
 
     Attributes:
         policy: Checkpoint of an hvs policy, as hvs pretrain makes it, or pretrained for the weights
@@ -26,9 +26,10 @@ class Finetune:
         out: Folder for the checkpoint.
         minutes: Stop after this much playing and learning, evaluations and eyes not counted (min).
         steps: Stop after this many environment steps.
-        seed: Of weights, scenes, exploration and batches.
+        seed: Seed of weights, scenes, exploration and batches.
         curriculum: Learn with wider tolerances first, or with starts nearer to the goal.
-        eye_rounds: How often, before, to let the policy play and train its eyes on what it saw.
+        eye_rounds: How often to let the policy play before RL, and to train its eyes on what it
+            saw.
         eye_frames: Frames a round.
         eye_steps: Optimiser steps a round.
         warm_up_steps: Environment steps in which the critics learn alone.
@@ -36,12 +37,12 @@ class Finetune:
         noise: Standard deviation of the exploration, as a share of the bound.
         actor_rate: Learning rate of what is added.
         penalty: Weight of the squared share of the bound that is used.
-        gamma: Discount: the success that a step of haste may cost is 1 minus this.
+        gamma: Discount; 1 minus this is the share of success that one step less is worth.
         shaping: Weight of the potential beside the sparse reward, which shows the way to a goal
             that is rarely reached; 0 leaves the sparse reward alone.
-        lost_share: Share of the episodes that play scenes again that were lost, once there are any:
-            a policy that is good already learns from little else.
-        environments: How many play; they share the scenes between them.
+        lost_share: Share of the episodes that play lost scenes again, once there are any: a policy
+            that is already good learns from little else.
+        environments: Number of environments, which share the scenes.
         ray: Let them play on a Ray cluster (docs/many-machines.md): auto for the one that this
             machine belongs to, an address such as 10.0.0.1:6379, or local.
         updates: Updates while 40 environment steps are played; four times as many while the

@@ -11,15 +11,15 @@ from hvs_suite.names import shown
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ImportLerobot:
-    """Take an eval_info.json of lerobot-eval in, as unverified: for comparing, not for the board.
+    """Import an eval_info.json of lerobot-eval, unverified: for comparing, not for the board.
 
     Attributes:
         file: The eval_info.json.
-        task: Named task that was evaluated; of several in the file, one.
-        policy: Name for the policy; the file does not say.
+        task: Named task that was evaluated; one of them if the file has several.
+        policy: Name for the policy, because the file does not contain it.
         out: File to write (JSON), replaced if it exists.
         split: Split that was played.
-        seed: First seed that lerobot-eval was given; 1000 unless it was told otherwise.
+        seed: First seed that lerobot-eval was given; 1000 is its default.
     """
 
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]

@@ -17,7 +17,8 @@ class Leaderboard:
         replay: Scenarios of each new result to play again before it is shown; 1000 plays all.
         reruns: Folder of the maintainers' own results on an unseen split, laid out likewise.
         ledger: File that remembers what was played; in the user's cache by default.
-        draft: Show what is no score yet, such as fewer scenarios; the board says so.
+        draft: Also show results that are not scores yet, such as those with fewer scenarios; the
+            board marks them.
     """
 
     results: Path = Path("eval/results")

@@ -1,7 +1,8 @@
 """Entry point of ``hvs``: reads the command line, runs one command, turns errors into one line.
 
 Exit codes: 0 on success, 1 where a check found something wrong, 2 for a user's mistake (one line on
-stderr that says how to mend it), 130 when interrupted. Only defects of ours show a traceback.
+stderr that says how to correct it), 130 when interrupted. Only defects of the suite show a
+traceback.
 """
 
 import contextlib

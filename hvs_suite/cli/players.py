@@ -1,4 +1,4 @@
-"""Who plays: local processes, or a Ray cluster."""
+"""The workers that play: local processes, or a Ray cluster."""
 
 import dataclasses
 from typing import TYPE_CHECKING
@@ -10,12 +10,12 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Players:
-    """What commands have in common whose episodes may be played by several at once.
+    """Options of all commands that can play episodes in several processes.
 
     Attributes:
-        workers: Processes that play; what they play is the same for any number. Without it 1 (of
-            pretrain and study 2), or with --ray one for each core of the cluster, also for those
-            that join it meanwhile.
+        workers: Processes that play; the results are the same for any number. By default 1 (2 for
+            pretrain and study), or with --ray one for each core of the cluster, also for cores that
+            join it later.
         ray: Play on a Ray cluster (docs/many-machines.md): auto for the one that this machine
             belongs to, an address such as 10.0.0.1:6379, or local for one of this machine alone.
     """
@@ -24,7 +24,7 @@ class Players:
     ray: str | None = None
 
     def players(self, local: int = 1) -> "Workers":
-        """Who plays.
+        """The workers that play.
 
         Args:
             local: Processes where neither is said.
@@ -33,7 +33,7 @@ class Players:
 
 
 def players(workers: int | None, ray: str | None, local: int) -> "Workers":
-    """Who plays, as the command line says it.
+    """The workers that play, as the command line names them.
 
     Args:
         workers: How many, if that is said.

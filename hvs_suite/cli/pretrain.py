@@ -20,8 +20,8 @@ class Pretrain(Players):
     """Train the hvs policy on demonstrations by behaviour cloning.
 
     The task comes from the dataset. Trains for --minutes or --steps, whichever ends first, or for
-    ten minutes if neither is given. Interrupted, it goes on from its last checkpoint when the same
-    command is given again.
+    ten minutes if neither is given. If it was interrupted, the same command continues from the last
+    checkpoint.
 
     Attributes:
         data: Root folder of the dataset, as hvs record makes it.
@@ -33,18 +33,19 @@ class Pretrain(Players):
         dagger_frames: Frames a round.
         inputs: What the policy is given: names joined by +, such as eih+joints; all of eih, eth
             and joints by default.
-        episodes: Learn from the first so many demonstrations alone.
+        episodes: Number of demonstrations to learn from, the first ones of the dataset; all by
+            default.
         rehearsal_frames: Frames a step that the head alone learns from, without their images.
-        keypoint_weight: Weight of the supervision by where the target is; 0 trains on actions.
+        keypoint_weight: Weight of the loss on where the target is; 0 trains on the actions alone.
         error_scale: Errors of a joint's step (rad) and of a place (m) weigh linearly below this
             and logarithmically above; five times the task's tightest tolerance by default.
-        eyes: Policy to begin with the eyes of, where a target is too small for fresh ones to find:
-            a checkpoint folder, or a named task for the weights shipped for it.
+        eyes: Policy whose eyes to start from, where the target is too small for untrained eyes to
+            find: a checkpoint folder, or a named task for the weights shipped for it.
         policy: Which policy to train: hvs, which knows targets on a level surface, or hvs_belief,
             which learns from any family's demonstrations.
         windows: Windows of control steps a step that belief and head of hvs_belief learn from.
         window_steps: Length of each.
-        seed: Of initial weights, held-out episodes and order.
+        seed: Seed of the initial weights, the held-out episodes and the order.
     """
 
     data: Path

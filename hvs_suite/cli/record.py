@@ -1,4 +1,4 @@
-"""``hvs record``: demonstrations of the expert as a LeRobot dataset."""
+"""``hvs record``: demonstrations as a LeRobot dataset."""
 
 import dataclasses
 import shlex
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Record(Players):
-    """Record demonstrations of the expert as a LeRobot dataset.
+    """Record demonstrations as a LeRobot dataset, of the expert or of any policy.
 
     Plays scenarios 0 to N-1 of the split; failures are kept and marked.
 
@@ -24,13 +24,16 @@ class Record(Players):
         episodes: Number of episodes to record.
         out: Root folder of the dataset; must not exist or be empty, unless --resume is given.
         split: Name of the split the scenarios come from.
-        resume: Go on with a recording that was interrupted.
+        resume: Continue a recording that was interrupted.
         start: Where the arm starts, if not where the task says; mixed starts half of the episodes
             near the goal.
         noise: Standard deviation of a disturbance of the executed joint targets, far from the goal
-            (rad); the expert's own action stays the label.
+            (rad); the demonstrator's own action stays the label.
+        policy: What demonstrates: expert, servo, a checkpoint folder, or code of your own as
+            module:factory, whose factory gets the environment and may know what is true.
         option: Parameter of the task to change for a study, such as target_diameter_m=0.03; give it
-            several times for several. The dataset says so, and is not one of the named task then.
+            several times for several. The dataset then records this and does not count as one of
+            the named task.
     """
 
     task: str
@@ -40,15 +43,21 @@ class Record(Players):
     resume: bool = False
     start: Literal["zero", "random", "near_goal", "mixed"] | None = None
     noise: float = 0.0
+    policy: str = "expert"
     option: tuple[str, ...] = ()
 
     def run(self) -> None:
         """Record, showing how it goes, and say what was recorded."""
         from hvs_suite import registry
+        from hvs_suite.datasets.metadata import EXPERT
         from hvs_suite.datasets.recorder import record
+        from hvs_suite.policies.catalogue import demonstrator_factory
 
         start = () if self.start is None else (f"start={self.start}",)
         options = registry.find(self.task).options_from_text((*start, *self.option))
+        # The recorder's own expert also looks for targets that no camera shows yet.
+        own = self.policy == EXPERT
+        make = None if own else demonstrator_factory(self.policy, self.task, options)
         with console.meter() as update:
             done = record(
                 self.task,
@@ -58,6 +67,8 @@ class Record(Players):
                 options,
                 workers=self.players(),
                 noise=self.noise,
+                demonstrator=self.policy,
+                make=make,
                 resume=self.resume,
                 progress=lambda state: update(
                     "recording", state.episodes / state.total, _words(state)

@@ -15,7 +15,7 @@ class Reproduce:
     """Record, pretrain, fine-tune and evaluate as the shipped weights of a task were made.
 
     Runs the commands of datasets/recipes and policies/recipes below the current folder, in runs/,
-    and prints the hours of each stage. Interrupted, the same command goes on.
+    and prints the hours of each stage. If it was interrupted, the same command continues.
 
     Attributes:
         task: Named task.

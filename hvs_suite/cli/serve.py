@@ -12,7 +12,7 @@ from hvs_suite.errors import OptionError, PolicyError
 class Serve:
     """Serve a policy over WebSocket for 'hvs evaluate --server', until Ctrl-C.
 
-    Whoever reaches the port can play the policy; nobody is asked for a password.
+    Anyone who can reach the port can use the policy; there is no password.
 
     Attributes:
         policy: servo, zero, pretrained, finetuned, a checkpoint folder or Hub id, or

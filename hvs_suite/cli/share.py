@@ -21,8 +21,9 @@ _LICENCE = re.compile(r"[A-Za-z0-9][A-Za-z0-9.+-]{0,63}")
 class Share:
     """Share a dataset: write its card, then pack it or push it to the Hugging Face Hub.
 
-    The dataset is checked first, pictures decoded but not drawn again; a damaged one is refused.
-    The Hub's token is taken from HF_TOKEN or an earlier login, and neither printed nor stored.
+    The dataset is checked first (pictures are decoded but not drawn again), and a damaged one is
+    refused. The Hub's token is taken from HF_TOKEN or an earlier login; it is neither printed nor
+    stored.
 
     Attributes:
         data: Root folder of the dataset; the card goes into it as README.md.

@@ -11,9 +11,9 @@ import tyro
 class Ship:
     """Share a trained policy: write its model card, and copy it or push it to the Hub.
 
-    Takes the folder that hvs pretrain made: weights, settings and how the training went, nothing
-    else. The Hub's token is taken from HF_TOKEN or an earlier login, and neither printed nor
-    stored.
+    Takes a folder that hvs pretrain or hvs finetune made, and shares only its weights, its settings
+    and how the training went. The Hub's token is taken from HF_TOKEN or an earlier login; it is
+    neither printed nor stored.
 
     Attributes:
         policy: Checkpoint folder; without --to-folder the card goes into it as README.md.

@@ -1,4 +1,4 @@
-"""Standard output and error whose reader may go away while the work goes on.
+"""Standard output and error that may lose their reader while the work goes on.
 
 ``hvs evaluate ... | head -1`` closes the pipe after a line, ``>&-`` closes the stream before the
 start. Neither is a reason to lose an evaluation that is half done, nor for a traceback.
@@ -13,7 +13,7 @@ _STANDARD = (0, 1, 2)
 
 
 class _Outlet(io.FileIO):
-    """A stream's own file; what nobody reads, or what does not fit on its device, is dropped."""
+    """A stream's own file; output without a reader, or without room on its device, is dropped."""
 
     is_full = False
 

@@ -82,7 +82,7 @@ class Compression(Players):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Ablation(Players):
-    """Measure what each choice of the hvs policy buys, by training without it.
+    """Measure what each design choice of the hvs policy contributes, by training without it.
 
     Every policy learns from the same data with the same seed and steps, and is judged on the same
     scenarios of split dev. Interrupted, the same command goes on.
@@ -213,7 +213,7 @@ class FewDemonstrations:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Robustness(Players):
-    """Measure where a policy breaks: one thing at a time differs from the task, at three strengths.
+    """Measure where a policy fails when one thing at a time differs from the task.
 
     Light, colours, texture, camera poses, noise, blur, latency, joint offsets, distractors, target
     and all of them together come unannounced: the policy is told of the task as named. Each scene

@@ -13,15 +13,15 @@ class TrainSac:
     """Train a policy from scratch by soft actor-critic, with the thesis's settings.
 
     Trains for --minutes or --steps, whichever ends first, or for forty minutes if neither is given.
-    Interrupted, it goes on from its last checkpoint when the same command is given again. Curves
-    and a film of each evaluation are in OUT/training.
+    If it was interrupted, the same command continues from the last checkpoint. Curves and a film of
+    each evaluation are in OUT/training.
 
     Attributes:
         task: A named task, such as align-thesis.
         out: Folder for the policy, which hvs evaluate --policy takes.
         minutes: Stop after this much playing and learning, evaluations not counted (min).
         steps: Stop after this many environment steps.
-        seed: Of weights, scenes, exploration and batches.
+        seed: Seed of weights, scenes, exploration and batches.
         eval_every: Environment steps between evaluations; one more comes at start and end.
         eval_episodes: Episodes an evaluation, on scenes of a split of their own.
         reward: Reward term to learn from; give it several times for several terms. Without it, the

@@ -19,13 +19,13 @@ BROKEN = 1
 class Verify(Players):
     """Play the logged actions of results again, without pictures, and recompute every number.
 
-    Exits with 1 and the reason if a file is not what it says it is.
+    Exits with 1 and the reason if a file differs from what is played.
 
     Attributes:
         files: Result files, or folders of them.
         sample: Scenarios of each file to play again, drawn with a new nonce; all by default.
-        nonce: What to draw the sample with, to repeat a draw that was printed.
-        submission: Also hold the files against the rules of the board (eval/SUBMITTING.md).
+        nonce: Nonce that an earlier run printed, to draw the same sample again.
+        submission: Also check the files against the rules of the board (eval/SUBMITTING.md).
         results: With --submission, the folder that holds <policy>/<task>.json.
         json: Print what was found as JSON.
     """

@@ -25,7 +25,8 @@ class View:
         task: A named task, such as align-easy.
         scenario: Index of the scenario in the split.
         split: Name of the split the scenario comes from.
-        policy: expert, zero, random, servo, pretrained, finetuned, or a checkpoint folder.
+        policy: expert, servo, push, zero, random, pretrained, finetuned, a checkpoint folder or Hub
+            id, or module:factory, which imports and runs that code.
         out: Write a film (.mp4 or .gif) instead of opening a window.
         option: Parameter of the task to change for a study, such as target_diameter_m=0.03; give it
             several times for several.

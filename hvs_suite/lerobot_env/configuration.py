@@ -121,7 +121,7 @@ class HvsEnvConfig(EnvConfig):
 
 
 def _check_policy(shown: Mapping[str, PolicyFeature], policy: str | None, task: str) -> None:
-    """Hold the policy that LeRobot is about to play against what the task shows and takes.
+    """Check that the policy that LeRobot is about to play fits the task's observations and actions.
 
     LeRobot compares names alone: pictures of another size would be played without a word.
 

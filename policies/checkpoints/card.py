@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from hvs_suite.datasets.metadata import EXPERT
 from hvs_suite.errors import PolicyError, first_line
 from hvs_suite.files import replacing
 from hvs_suite.policies.checkpoints.files import FILES, MOST_SETTINGS_BYTES, home, read_config
@@ -108,7 +109,7 @@ def describe(
         "task": f"{spec.instruction()} Target: {words.target}; within {words.tolerance}",
         "inputs": inputs,
         "output": "`action` 7: joint position targets in units of the joint range",
-        **(_rl_rows if was_fine_tuned else _imitation_rows)(settings, outcome),
+        **(_rl_rows(settings, outcome) if was_fine_tuned else _imitation_rows(trained, outcome)),
         "time": _time(outcome, trained, was_fine_tuned),
         "seed": str(settings["seed"]),
         "licence": LICENCE,
@@ -140,22 +141,27 @@ def describe(
     return "\n".join(lines)
 
 
-def _imitation_rows(settings: Mapping[str, Any], outcome: Mapping[str, Any]) -> dict[str, str]:
+def _imitation_rows(trained: Mapping[str, Any], outcome: Mapping[str, Any]) -> dict[str, str]:
     """What `pretrain` did."""
+    settings = trained["settings"]
+    # Runs from before this was noted learned from the expert.
+    demonstrator = trained.get("demonstrator", EXPERT)
+    by_expert = demonstrator == EXPERT
+    action = "the expert's action" if by_expert else "the demonstrator's action"
     rounds = outcome["rounds"]
     corrected = sum(played["frames"] for played in rounds)
     return {
         "parameters": f"{outcome['n_parameters']:,}",
-        "demonstrations": "of the suite's expert",
+        "demonstrations": "of the suite's expert" if by_expert else f"of `{demonstrator}`",
         "DAgger": f"{len(rounds)} rounds, {corrected:,} frames played by the policy itself under "
         "the expert's labels"
         if rounds
         else "none",
         "optimiser steps": f"{outcome['step']:,} of {settings['batch_size']} frames",
-        "supervision in training": "the expert's action, and where the target is "
-        "(`privileged.*`); neither is an input"
+        "supervision in training": f"{action}, and where the target is (`privileged.*`); neither "
+        "is an input"
         if settings["keypoint_weight"] > 0
-        else "the expert's action",
+        else action,
     }
 
 

@@ -1,10 +1,10 @@
 """What the files of a checkpoint may hold; all of them are checked before any of them is loaded.
 
-A checkpoint may be a stranger's. LeRobot imports and calls whatever a processor step names under
-``class``, and some of its own steps and policies fetch a tokenizer or a network from the Hub and
-run code that comes with it. So only policies and steps are taken that are made from the folder's
-numbers alone, by classes that LeRobot knows by name; what else there is plays as ``module:factory``
-(see `hvs_suite.policies.imported`), by which a person says that the code is to be run.
+A checkpoint may come from other people. LeRobot imports and calls whatever a processor step names
+under ``class``, and some of its own steps and policies fetch a tokenizer or a network from the Hub
+and run code that comes with it. So the suite accepts only policies and steps that are made from the
+folder's numbers alone, by classes that LeRobot knows by name. Any other policy plays as
+``module:factory`` (see `hvs_suite.policies.imported`), with which the user agrees to run its code.
 """
 
 from collections.abc import Callable, Mapping
@@ -126,7 +126,7 @@ class _Processor(_Settings):
 def read_config(folder: Path) -> dict[str, Any]:
     """Check all files of a LeRobot checkpoint, and read its ``config.json``.
 
-    Whoever loads a checkpoint calls this first.
+    To be called before a checkpoint is loaded.
 
     Args:
         folder: The checkpoint.

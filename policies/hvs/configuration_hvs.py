@@ -44,7 +44,7 @@ class HvsConfig(PreTrainedConfig):
         family: Family of the tasks that it was trained for.
         control_period_s: Length of their control step (s).
         options: Options of the task that it was trained with, where they differ from the named one;
-            `hvs_suite.policies.trained_for` holds them against what is to be played.
+            `hvs_suite.policies.trained_for` compares them with the task to be played.
         keypoint_weight: Weight of the losses against the projected target and its place in space,
             where the dataset has ``privileged.*`` columns; 0 trains on actions alone.
         optimizer_lr: Peak learning rate of stock ``lerobot-train``.

@@ -103,7 +103,7 @@ class HvsPolicy(PreTrainedPolicy):
         return lesson.loss, lesson.parts
 
     def supervise(self, batch: dict[str, Tensor]) -> Lesson:
-        """Hold what the network makes of a batch against what is true.
+        """Compare the network's output for a batch with the truth.
 
         Args:
             batch: The inputs (images uint8, or float in [0, 1]), ``action`` (B, 7), and where the
@@ -144,12 +144,12 @@ class HvsPolicy(PreTrainedPolicy):
 
         Args:
             batch: As in `supervise`, images left out.
-            lesson: From other frames: what the eyes made of those decides what they would have made
-                of these.
+            lesson: From other frames: what the eyes saw in those decides what they would have seen
+                in these.
             generator: For the draws.
 
         Returns:
-            The loss; 0 where nobody says where the targets are.
+            The loss; 0 if the batch does not tell where the targets are.
         """
         state = batch[OBS_STATE] if self.network.shape.state_dim else None
         if set(lesson.truths) != set(self.network.shape.cameras) or state is None:

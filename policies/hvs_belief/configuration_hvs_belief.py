@@ -73,7 +73,7 @@ class HvsBeliefConfig(PreTrainedConfig):
             raise ValueError(f"The policy reads one observation, got {self.n_obs_steps=}.")
 
     def name_inputs(self) -> None:
-        """Say which of a new policy's inputs are goal and wrench, where nobody has."""
+        """Set which of a new policy's inputs are goal and wrench, unless they are set already."""
         goal, wrench = further_keys(self.input_features or {})
         self.goal_key = self.goal_key or goal
         self.wrench_key = self.wrench_key or wrench

@@ -43,7 +43,7 @@ class HvsBeliefPolicy(PreTrainedPolicy):
         **kwargs: What else LeRobot's factory passes; not used.
 
     Raises:
-        ValueError: The network cannot read these inputs, or nobody says what the cell is.
+        ValueError: The network cannot read these inputs, or the description of the cell is missing.
         DatasetError: The dataset was not recorded by this suite, or is damaged.
     """
 

@@ -1,8 +1,8 @@
 """DAgger: the policy plays, the expert says at every step what it would have done instead.
 
-Cloning shows the policy only where the expert goes; a policy that errs a little soon stands where
-nobody has shown it anything. Frames of the policy's own episodes under the expert's labels mend
-that (Ross, Gordon and Bagnell, 2011: https://arxiv.org/abs/1011.0686).
+Cloning shows the policy only states of the expert's episodes, but small errors of the policy soon
+lead to other states. Frames of the policy's own episodes, labelled by the expert, fix that (Ross,
+Gordon and Bagnell, 2011: https://arxiv.org/abs/1011.0686).
 """
 
 import contextlib
@@ -79,7 +79,7 @@ def watch(env: "Environment", policy: Policy, scenario: int) -> PlayedEpisode:
 
     Args:
         env: The task.
-        policy: Who plays.
+        policy: The policy that plays.
         scenario: Index in the split.
 
     Returns:
@@ -93,7 +93,7 @@ def correct(env: "Environment", policy: Policy, scenario: int) -> PlayedEpisode:
 
     Args:
         env: The task.
-        policy: Who plays.
+        policy: The policy that plays.
         scenario: Index in the split.
 
     Returns:
@@ -162,7 +162,7 @@ def play_round(
         folder: Gets the round, whole or not at all.
         frames: How many to keep.
         first_scenario: Index to begin with; give one that the dataset does not hold.
-        workers: Processes that play, or others elsewhere. The result is the same whoever plays.
+        workers: Processes that play, or others elsewhere. The result is the same with any of them.
         labelled: Ask the expert at every step what it would have done.
         on_frames: Called with the number of frames just kept.
 

@@ -151,7 +151,7 @@ class Demonstrations(FramePool):
         manifest: Of the dataset.
         cache: Folder for decoded frames.
         seed: Chooses the held-out episodes.
-        episodes: Learn from the first so many alone; None from all.
+        episodes: Learn from this many episodes, the first ones; None for all.
         with_memory: Work out what an `HvsNetwork` would remember at each frame.
         on_frames: Called with the number of frames just decoded, over all cameras.
 

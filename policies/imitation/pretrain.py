@@ -2,7 +2,7 @@
 
 The loss is that of `HvsPolicy.forward`: the expert's joint step on a logarithmic scale, and the
 projected target as seen by each camera. A run is a function of dataset, seed and number of steps;
-killed, it goes on from its last checkpoint when the same command is given again.
+if it was killed, the same command continues from the last checkpoint.
 """
 
 import dataclasses
@@ -136,7 +136,7 @@ def pretrain(
         OptionError: No budget, or a number that makes no sense.
         OutputError: ``out`` cannot be written, its disk is full, or it holds something else than
             this run. With room again, the same command goes on from the last checkpoint.
-        PolicyError: The eyes do not fit, or the loss is no number any more.
+        PolicyError: The eyes do not fit, or the loss is no longer a number.
     """
     budget = Budget(steps, minutes)
     check_workers(workers)
@@ -159,6 +159,7 @@ def pretrain(
             PACKAGES,
             data=str(data),
             options=dict(manifest.options),
+            demonstrator=manifest.demonstrator,
             policy={
                 "type": policy.config.type,
                 "channels": policy.config.channels,
@@ -186,7 +187,7 @@ def _teacher(
     settings: Settings,
     folder: Path,
 ) -> Teacher:
-    """Who teaches a fresh policy."""
+    """The teacher of a new policy."""
     if settings.policy == "hvs":
         return FrameTeacher(policy, demonstrations, settings)
     set_prior(policy, demonstrations)

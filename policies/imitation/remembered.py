@@ -1,7 +1,7 @@
 """What a policy would remember at each frame of a recording, as training gives it to the network.
 
-Nobody played the frames with the network that learns, so its memory is worked out from what is
-true, and is off by what trained eyes are off.
+The frames were not played with the network that learns. So its memory is computed from the true
+state, with errors as large as those of trained eyes.
 """
 
 from collections.abc import Mapping, Sequence

@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 from hvs_suite.datasets.features import ACTION_EXECUTED
+from hvs_suite.datasets.metadata import EXPERT
 from hvs_suite.errors import DatasetError, OptionError, PolicyError
 from hvs_suite.policies.belief.cell_model import cell_model
 from hvs_suite.policies.belief.settings import as_numbers, further_keys
@@ -100,6 +101,11 @@ class Settings:
         for name in ("dagger_rounds", "rehearsal_frames"):
             if getattr(self, name) < 0:
                 raise OptionError(f"{name} must be 0 or more, not {getattr(self, name)}")
+        if self.dagger_rounds and manifest.demonstrator != EXPERT:
+            raise OptionError(
+                f"{manifest.root} was recorded with {manifest.demonstrator}, and the expert labels "
+                "the rounds of DAgger, which acts otherwise; leave --dagger-rounds out"
+            )
         if self.episodes is not None and not 1 <= self.episodes <= manifest.n_episodes:
             raise OptionError(
                 f"episodes must be 1 to the dataset's {manifest.n_episodes}, not {self.episodes}"

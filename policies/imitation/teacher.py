@@ -1,4 +1,4 @@
-"""How a network is taught from demonstrations: what the training loop asks of either kind."""
+"""How a network learns from demonstrations: the interface to the training loop."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -42,7 +42,7 @@ class Teacher(Protocol):
         """Whether `look_again` is to be called at this part of the training, 0 to 1."""
 
     def look_again(self, share: float) -> None:
-        """Do what is too dear for every step; what it makes is a function of the weights."""
+        """Do what takes too long for every step; the result is a function of the weights."""
 
     def lesson(self, rows: npt.NDArray[np.int64], step: int) -> tuple[Tensor, Parts]:
         """Loss to learn from, and what it is made of.

@@ -1,8 +1,8 @@
 """The network compiled for playing: one observation at a time, on one core.
 
-Called operation by operation from Python, a decision is some two thousand calls, and what takes the
-time is not the sums but getting to them, all the more where the renderer has just swept the caches.
-Traced once and frozen, it is one call of some six hundred.
+Called operation by operation from Python, a decision takes some two thousand calls, and most of the
+time is the overhead of the calls, even more after the renderer has emptied the processor's caches.
+Traced once and frozen, it is one call of some six hundred operations.
 """
 
 import warnings
@@ -51,7 +51,7 @@ class CompiledNetwork:
 
 
 class CompiledFeatures:
-    """What an `HvsNetwork` that reads joints makes of an observation, for who acts on it himself.
+    """Computes the features of an `HvsNetwork` that reads joints, for callers that decide by them.
 
     Args:
         network: In evaluation mode; later changes of its weights are not noticed.
@@ -119,7 +119,7 @@ class _Decides(nn.Module):
     def forward(
         self, images: tuple[Tensor, ...], state: Tensor, memory: Tensor
     ) -> tuple[Tensor, ...]:
-        """What there is to say, and the next memory."""
+        """The output, and the next memory."""
         named = dict(zip(self._network.shape.cameras, images, strict=True))
         decision = self._network(named, state, memory)
         return *self._says(self._network, decision, state), decision.memory

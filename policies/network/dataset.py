@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from hvs_suite.datasets import reader
 from hvs_suite.datasets.features import ACTION, ACTION_EXECUTED, dataset_features
-from hvs_suite.datasets.metadata import read_metadata
+from hvs_suite.datasets.metadata import EXPERT, read_metadata
 from hvs_suite.errors import DatasetError, OptionError, UnknownTaskError
 from hvs_suite.policies.network.geometry import Calibration, calibrate
 from hvs_suite.policies.network.network import IMAGE_PREFIX, N_JOINTS, STATE
@@ -44,6 +44,7 @@ class Manifest:
         features: LeRobot's features by key.
         n_frames: Frames.
         n_episodes: Episodes.
+        demonstrator: The policy that chose the actions.
     """
 
     root: Path
@@ -53,6 +54,7 @@ class Manifest:
     features: Mapping[str, Mapping[str, Any]]
     n_frames: int
     n_episodes: int
+    demonstrator: str = EXPERT
 
     @property
     def cameras(self) -> dict[str, tuple[int, int, int]]:
@@ -121,6 +123,7 @@ def read_manifest(root: Path) -> Manifest:
         features=info["features"],
         n_frames=info["total_frames"],
         n_episodes=info["total_episodes"],
+        demonstrator=origin.demonstrator,
     )
     try:
         wanted = dataset_features(find(origin.task).with_options(origin.options))
@@ -128,7 +131,7 @@ def read_manifest(root: Path) -> Manifest:
         raise DatasetError(f"{root}: hvs.json: {error}") from error
     for key in manifest.trained_keys:
         found = list(manifest.features[key]["shape"])
-        # Pictures may be smaller than the task's; their size is held against the files.
+        # Pictures may be smaller than the task's; their size is checked in the files.
         if key.startswith(IMAGE_PREFIX):
             continue
         right = list(wanted[key]["shape"]) if key in wanted else "recorded on this task"

@@ -34,8 +34,8 @@ LINEARISATION_RANGE_M = 0.10
 LINEARISATION_RANGE_RAD = 0.30
 # Added to the time of a way that leads out of the joint ranges.
 UNREACHABLE_S = 100.0
-# How far below the lowest goal the flange may be sent (m): more than anyone overshoots who is at
-# rest soon, and less than the height over the surface at which goals lie.
+# How far below the lowest goal the flange may be sent (m): more than an arm overshoots that comes
+# to rest soon, and less than the height of goals over the surface.
 LEAST_HEIGHT_MARGIN_M = 0.01
 # Rounds of Gauss-Newton that lift the flange, and their damping.
 LIFTS = 4
@@ -177,7 +177,7 @@ def postures(goal: Tensor) -> Tensor:
 def way_to_posture(q: Tensor, goal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The way to the nearer of the two plain postures that lie within the joint ranges.
 
-    Nearer is where the slowest joint arrives first at full speed, as a demonstrator reckons.
+    The nearer one is where the slowest joint arrives first at full speed, as for the demonstrator.
 
     Args:
         q: Joint angles, (B, 7) rad.
@@ -259,8 +259,8 @@ def look_height(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """How high a disc lies, by how large it appears to the eye in the hand.
 
-    An error of some share of a pixel is an error of the distance that grows with its square; so a
-    look weighs as the fourth power of how close it is, one from the goal 1.
+    A constant error in pixels is an error in distance that grows with the square of the distance.
+    So a look has the inverse fourth power of its distance as weight, 1 at the goal.
 
     Args:
         motion: Pose of the flange, where the camera sits.

@@ -3,10 +3,10 @@
 Each camera has its own small convolutional encoder that ends in one *keypoint*: the softmax of one
 channel is a distribution over the image, its mean the target's centre. The keypoints are placed in
 space by fixed geometry, and a small perceptron turns joints and target into a joint step on a
-logarithmic scale, so that errors of a micrometre and of a metre both teach it something. Where a
-camera does not see the target, the place where it last saw it stands in; how high the target lies
-is the mean of what its size has said so far; and where the arm has been sent already, it need not
-be sent again: a memory of a few numbers, which the caller keeps.
+logarithmic scale, so that it learns from errors of a micrometre and of a metre alike. A memory of a
+few numbers, which the caller keeps, holds three things: where each camera last saw the target, for
+when it does not see it; the mean of the heights that the target's size has shown so far; and where
+the arm has already been sent.
 
 No LeRobot in here: a rollout worker starts in the time torch takes to import.
 """
@@ -322,7 +322,7 @@ class HvsNetwork(nn.Module):
         self.register_buffer("plane_height", torch.tensor(0.0))
         self.register_buffer("standoff", torch.tensor(0.05))
         self.register_buffer("size_at_1m", torch.tensor(0.0))
-        # Until it is known, nothing is too low.
+        # Until it is set, no height is too low.
         self.register_buffer("lowest_goal", torch.tensor(-math.inf))
         n_cameras = len(shape.cameras)
         width = SIGHTING_FEATURES * n_cameras
@@ -450,7 +450,7 @@ class HvsNetwork(nn.Module):
         lift[:, 2] = self.standoff
         sums = memory[:, HEIGHT_SUMS]
         if "eih" in sightings:
-            # Where the joints lie about the height, the disc's size tells the truth.
+            # Where the joints give a wrong height, the disc's size gives the right one.
             depth, height, sums = self._height(motion, sightings["eih"], sums)
             lift = lift + F.pad(height, (2, 0))
         goals = [target + lift]
@@ -607,16 +607,17 @@ class HvsNetwork(nn.Module):
         return depth, believed, sums.detach()
 
     def _with_residual(self, inputs: Tensor, out: Tensor, useful: Tensor) -> tuple[Tensor, Tensor]:
-        """The output with what fine-tuning adds to what of it is of use, and what this reads."""
+        """The output, with the residual added to its useful part, and the residual's inputs."""
         known = torch.cat([inputs, useful], dim=1)
         if self.residual is not None:
             out = useful + self.shape.residual_bound * self.residual(known)
         return out, known
 
     def _within_reach(self, out: Tensor, begun: Tensor) -> Tensor:
-        """What of the head's output is of use: the set point moves only as fast as the joints may.
+        """The part of the head's output that the set point can follow within the joints' speeds.
 
-        Who asks for seven times that gets no more, but a residual that is added to it is lost.
+        A larger output would not move the set point further, but it would hide a residual that is
+        added to it.
 
         Args:
             out: (B, 7).
@@ -635,8 +636,8 @@ class HvsNetwork(nn.Module):
         """Put the target into space.
 
         A camera counts as far as it sees the target and is to be trusted; what it remembers, as far
-        as it does not see it. Where the eye to hand stands a little elsewhere than it should, it is
-        centimetres off, and what the eye in hand saw a second ago is better.
+        as it does not see it. If the pose of the eye to hand is not exact, its estimate is wrong by
+        centimetres, and what the eye in hand saw a second ago is better.
 
         Returns:
             The best estimate (B, 3) m; every estimate with its weight, (B, 2 n + 1, 4), what n
@@ -664,7 +665,7 @@ class HvsNetwork(nn.Module):
         now = len(places)
         stacked = torch.stack([*places, *(slot[:, :3] for slot in slots)], dim=1)
         best = (weights[:, :, None] * stacked).sum(dim=1)
-        # An empty memory stands at the best estimate, so that it says nothing.
+        # An empty memory is set to the best estimate, so that it has no effect.
         places += [torch.where(slot[:, 3:] > 0, slot[:, :3], best) for slot in slots]
         weights = torch.cat([weights, weights[:, :now].sum(dim=1, keepdim=True)], dim=1)
         estimates = torch.cat([torch.stack([*places, best], dim=1), weights[:, :, None]], dim=2)
@@ -673,7 +674,8 @@ class HvsNetwork(nn.Module):
     def to_action(self, out: Tensor, origin: Tensor | None) -> Tensor:
         """Decode the head's output, and keep the flange from going below where goals lie.
 
-        Who comes down fast, one joint against another, is easily some centimetres too low.
+        An arm that comes down fast, with joints that move against each other, may get some
+        centimetres too low.
 
         Args:
             out: (B, 7).
@@ -754,7 +756,7 @@ class HvsNetwork(nn.Module):
 def make_residual(n_features: int, hidden: int) -> nn.Sequential:
     """What fine-tuning adds to the head: features (B, n) to shares of the bound, (B, 7) in [-1, 1].
 
-    Nothing at first: its last layer begins at zero.
+    It adds nothing at first, because its last layer begins at zero.
 
     Args:
         n_features: Numbers that it reads.
@@ -793,9 +795,9 @@ def flange_loss(
 ) -> Tensor:
     """Loss of where a joint step brings the flange, against the way that is left to go.
 
-    Joint by joint, a tenth too much of a fast step is a small error. But the arm comes down on the
-    target in steps of a decimetre, one joint against another, and what counts is how far the flange
-    goes astray compared with how far it still has to go.
+    A tenth too much of a fast step is a small error for a single joint. But the arm comes down on
+    the target in steps of a decimetre, with joints that move against each other. So this loss
+    compares the error at the flange with the distance that is left to go.
 
     Args:
         error: Joint step minus the expert's, (B, 7) rad.

@@ -1,10 +1,10 @@
-"""Training the head on frames whose images nobody looks at.
+"""Training the head on frames without their images.
 
-A frame costs the eyes some seventy times what it costs the head at 112 px, twice that at 512 px,
-and the head needs more of them: it has to learn how to move from anywhere. So it rehearses on many
-more frames than the eyes see. What the eyes would have made of those is drawn from what they made
-of others: where the target truly was, plus the error and the doubts of an eye that saw a target of
-about the same size.
+A frame costs about seventy times as much computing in the eyes as in the head at 112 px, and twice
+that at 512 px. The head needs more frames, because it has to learn how to move from anywhere. So it
+also learns from many frames that the eyes do not process. For these, the output of the eyes is
+replaced by the true place of the target plus the error and the uncertainty that an eye had on
+another frame with a target of about the same size.
 """
 
 from collections.abc import Mapping
@@ -26,14 +26,14 @@ def drawn_sightings(
     wanted: Mapping[str, Tensor],
     generator: torch.Generator,
 ) -> dict[str, Sighting]:
-    """What eyes would make of frames that they do not look at.
+    """Draws what the eyes would see in frames that they do not process.
 
     Args:
         sightings: Camera name to what its eye made of some frames.
         truths: Camera name to where the target was in them: u, v, apparent diameter in image
             widths, visible 0/1, (B, 4).
         wanted: The same for the other frames, (n, 4).
-        generator: Draws whose error each frame gets.
+        generator: Draws from which other frame each frame gets its error.
 
     Returns:
         Camera name to sightings (n, ...), through which no gradient flows.

@@ -203,7 +203,7 @@ def save_actor(folder: Path, actor: "Actor") -> None:
 
 
 def read_config(folder: Path) -> Config:
-    """Check a folder's files and read its ``config.json``; whoever loads the actor calls this.
+    """Check a folder's files and read its ``config.json``; to be called before loading the actor.
 
     Args:
         folder: The checkpoint.

@@ -10,9 +10,9 @@ from hvs_suite.errors import OptionError
 class Settings:
     """Settings of soft actor-critic; the defaults are the thesis's wherever it states a value.
 
-    It states none for `updates` and `hidden`. One update after every 20 environment steps is what
-    its library does when told nothing else, and two layers of 256 are what that library's example
-    has. `random_steps` counts steps where the thesis counts episodes: 500 of at most 20 steps.
+    It states none for `updates` and `hidden`. One update after every 20 environment steps is the
+    default of its library, and two layers of 256 are those of that library's example.
+    `random_steps` counts steps where the thesis counts episodes: 500 of at most 20 steps.
     `replay_size` is the smaller of its two: SB3 keeps the images before and after every step, so
     that 10,000 steps at 112 px take 1.5 GB of memory, and 50,000 would take 7.5 GB.
 

@@ -1,7 +1,7 @@
 """Soft actor-critic from scratch, as the thesis had it, on Stable-Baselines3.
 
-A run is a function of task, settings, seed and number of steps. Killed, it goes on from its last
-checkpoint when the same command is given again, and ends like one that was left alone.
+A run is a function of task, settings, seed and number of steps. If it was killed, the same command
+continues from the last checkpoint and ends like an uninterrupted run.
 """
 
 import contextlib

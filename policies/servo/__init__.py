@@ -45,7 +45,7 @@ def make_servo(env: Playground) -> Policy:
 
 
 def make_push(env: Playground) -> Policy:
-    """``push``: as ``servo``, but straight down where it sees the hole; what sight alone is worth.
+    """``push``: as ``servo``, but straight down where it sees the hole, by vision alone.
 
     Raises:
         PolicyError: There is nothing to insert.

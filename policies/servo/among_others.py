@@ -1,13 +1,13 @@
-"""``servo`` among other things: it tells the target by colour and outline, and keeps high.
+"""``servo`` among other things: finds the target by colour and outline, and stays high.
 
 A patch of the right colour is the target if it covers as much of the picture as a whole disc of the
 target's size would there, and if its parts are no farther from its middle than a disc's: a square
-covers a quarter more, a ring a quarter less, half a disc half. Which colour is meant, a task with a
-choice shows in an observation.
+covers a quarter more, a ring a quarter less, half a disc half. In a task with a choice, an
+observation says which colour is meant.
 
 It does not see obstacles: it has no model of their shapes, and the one picture from above that
-shows them does not tell how high they are. So it does what one does in a cell that is not mapped:
-up first, over to a place well above the target, and straight down.
+shows them does not tell how high they are. So it moves as one does in an unknown cell: first up,
+then to a place well above the target, and then straight down.
 """
 
 from typing import Any

@@ -1,4 +1,4 @@
-"""``servo`` for targets that vanish and appear elsewhere: it notices, forgets, and looks anew."""
+"""``servo`` for targets that vanish and appear elsewhere: it notices, forgets and looks again."""
 
 import numpy as np
 import numpy.typing as npt

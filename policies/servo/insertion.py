@@ -3,7 +3,7 @@
 The eyes say where the paint is; with that the tip goes down onto the bushing. Where the hole is not
 there, it goes along a spiral at a light force until it drops into the mouth, and lets the mouth
 lead it (`hvs_suite.tasks.shared.feeling`). ``push`` does without the spiral: it goes straight down
-where it believes the hole to be, which shows what sight alone is worth.
+at its estimate of the hole, which shows what vision alone achieves.
 """
 
 import numpy as np
@@ -86,7 +86,7 @@ class InsertionServo(StillTargetServo):
         return self._guarded.straight(set_point, ahead, goal)
 
     def _look_closely(self, q: FloatArray) -> None:
-        """Count looks from near by; settle for what they say once there are enough."""
+        """Count looks from near by, and fix the estimate once there are enough."""
         if not self._estimate.is_known or not np.isfinite(self._estimate.in_hand_sigma_m):
             return
         place, _ = self._estimate.place()

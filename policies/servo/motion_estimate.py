@@ -3,8 +3,8 @@
 The state is place, velocity and acceleration on the surface, and the error that the eye-to-hand
 camera's calibration makes there, which is common to all its pictures. A smooth motion that stays in
 a bounded place turns back: its jerk is, on the average, against its velocity, as in an oscillation
-of one pace. So the state moves on like that, and what this does not foresee is white jerk. For
-targets known to move straight pace, acceleration and jerk are zero.
+of one frequency. So the state moves on in this way, and white jerk stands for the rest. For targets
+known to move straight, the frequency, acceleration and jerk are zero.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""``servo`` for a target on a panel whose height and slope are not known: it looks from all around.
+"""``servo`` for a target on a panel of unknown height and slope: it looks from all around.
 
 A practitioner's way, in four steps:
 
@@ -6,8 +6,8 @@ A practitioner's way, in four steps:
    hand sees it too: where the rays of its looks meet is the target.
 2. Come nearer until it sees the marks around the target. One look from straight above tells their
    slope badly, where they are small: the slope shows to the second order only, and by perspective.
-3. So look at them from all around, leaning to every side, until the fit of all looks together is
-   sure to a part of the tolerance, or there is no more time.
+3. So look at them from all around, leaning to every side, until the uncertainty of the fit of all
+   looks is a part of the tolerance, or there is no more time.
 4. Go there, and go on looking. When the arm has stood there for long enough, and the episode has
    not ended, the estimate was wrong: look around once more.
 """
@@ -157,7 +157,7 @@ class SlopedTargetServo(StillTargetServo):
         if np.linalg.norm(p - goal.position) < _STANDS_M:
             self._waited += 1
         if self._waited > spec.hold_steps + _PATIENCE and not is_late:
-            # It stands where it believes the goal to be, and the episode goes on.
+            # The arm is at its estimate of the goal, but the episode goes on.
             self._is_going = False
             self._sure = _SURER * self._sure
 

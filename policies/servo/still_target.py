@@ -3,7 +3,7 @@
 It sees the observations alone and knows what the cell's manual says: the task's parameters, the
 robot's kinematics, both cameras' nominal calibration with its published accuracy, and that the
 surface is the plane z = 0. It is not told what a scenario disturbs (pose of the eye-to-hand camera,
-encoder zeros, colours) nor the latency, which it notices by itself.
+encoder zeros, colours), nor the latency, which it estimates by itself.
 
 A decision is:
 
@@ -11,12 +11,12 @@ A decision is:
    into places on the surface through the camera models and the measured joints.
 2. Fuse them: the eye-to-hand camera serves the approach, the eye-in-hand camera the end. Near the
    goal the disc's apparent size also gives the height, which encoder errors hide.
-3. Go where the target is believed to be, no lower than the eye-in-hand camera needs to see it for
-   certain. While nobody has seen it, hover over the nearest part of the surface that nobody has
-   looked at.
+3. Go to the estimated target, but stay as high as the eye-in-hand camera needs to see it for
+   certain. While no camera has seen it, hover over the nearest part of the surface that no camera
+   has looked at.
 4. Move there the fastest way within joint limits and clear of collisions: the expert's motion,
-   started from what is believed instead of from what is true. Hovering, prefer postures from
-   which the way on to the goal is short: others end at a joint's stop and have to turn back.
+   planned from the estimate in place of the true state. Hovering, prefer postures from which the
+   way on to the goal is short: others end at a joint's stop and have to turn back.
 """
 
 from __future__ import annotations
@@ -229,7 +229,7 @@ class StillTargetServo:
         return max(self._variant.look_from_m, needed) * (1.0 + 0.3 * self._misses)
 
     def _look_out(self, q: FloatArray) -> FloatArray:
-        """Where to hover to look at what nobody has looked at, (3,) m.
+        """Where to hover to look at what no camera has seen, (3,) m.
 
         Of a few places, the one that shows most of the hidden surface for the time it takes; kept
         until there is nothing left to see from it.

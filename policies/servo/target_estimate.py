@@ -133,7 +133,7 @@ class TargetEstimate:
     """
 
     def __init__(self, eth_sigma_m: float) -> None:
-        # Never quite 0: nobody can be sure of a pose to a hundredth of a millimetre.
+        # Never quite 0, because no pose is certain to a hundredth of a millimetre.
         self._eth_variance = eth_sigma_m**2 + 1e-10
         self._eth_information = np.zeros((2, 2))
         self._eth_weighted = np.zeros(2)

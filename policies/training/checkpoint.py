@@ -1,4 +1,4 @@
-"""Writes a LeRobot policy so that what stood there before stays whole until it is replaced."""
+"""Writes a LeRobot policy so that an earlier one stays intact until it is replaced."""
 
 import json
 import tempfile

@@ -1,6 +1,6 @@
-"""TensorBoard curves, written by who adds a point: a disk that is full is noticed there and then.
+"""TensorBoard curves, written when a point is added, so that a full disk is noticed at once.
 
-TensorBoard's own writer does so in a thread, whose complaints nobody gets to hear.
+TensorBoard's own writer does so in a thread, and its errors are lost.
 """
 
 import os

@@ -1,4 +1,4 @@
-"""The folder of a training run: whose it is, and what it was started with."""
+"""The folder of a training run: which run it belongs to, and what it was started with."""
 
 import contextlib
 import importlib.metadata
@@ -18,7 +18,7 @@ CONFIG = "train_config.json"
 def claimed(out: Path, settings: Mapping[str, Any]) -> Iterator[None]:
     """Take a folder, or recognise it as an interrupted run with the same settings.
 
-    As long as the block lasts, nobody else can.
+    No other process can while the block lasts.
 
     Args:
         out: The folder; made if missing.

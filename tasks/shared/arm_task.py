@@ -1,7 +1,7 @@
 """The task that all families share: arm, set points, latency, cameras, hold, outcome and info.
 
-`ArmTask` is what `dm_control` plays. What is special about a task is its family's, an object with a
-few methods (see `hvs_suite.tasks.shared.family`).
+`ArmTask` is what `dm_control` plays. The family, an object with a few methods, defines what is
+special about a task (see `hvs_suite.tasks.shared.family`).
 """
 
 import hvs_suite.cell  # noqa: F401 - chooses the OpenGL backend before MuJoCo is imported
@@ -314,7 +314,7 @@ class ArmTask(composer.Task):
         return float(sum(self._reward_terms.values()))
 
     def get_discount(self, physics: mjcf.Physics) -> float:
-        """0 after goal or collision; truncation is no end of the world and keeps the discount."""
+        """0 after goal or collision; truncation keeps the discount."""
         del physics
         return 0.0 if self._is_final else self.spec.discount
 
@@ -399,7 +399,7 @@ class ArmTask(composer.Task):
     def tip(self, physics: mjcf.Physics) -> Tip:
         """Where the tool tip is now."""
         data = physics.data.ptr
-        # Copies: MuJoCo's arrays change under the hands of whoever keeps them.
+        # Copies, because MuJoCo changes its arrays in place.
         return Tip(data.site_xpos[self._tip].copy(), data.site_xmat[self._tip][2::3].copy())
 
     def distance_m(self, physics: mjcf.Physics) -> float:
@@ -484,7 +484,7 @@ class ArmTask(composer.Task):
         return self._speed.copy()
 
     def pending_setpoints(self) -> list[FloatArray]:
-        """True set points that were commanded and still wait out the latency, oldest first."""
+        """True set points that were commanded but do not act yet (latency), oldest first."""
         return [target - self.scenario.joint_offset for target in self._queue]
 
     def landing_mm(self, physics: mjcf.Physics) -> FloatArray:

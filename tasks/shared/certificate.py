@@ -308,7 +308,7 @@ def check_visibility(
     find: Find = _find_red,
     needed_share: float = 99.0,
 ) -> list[Check]:
-    """Can the target be found at the start, or soon enough after?
+    """Can the target be found at the start, or soon enough afterwards?
 
     Args:
         env: The named task.
@@ -393,7 +393,7 @@ def check_accuracy(
     """
     spec: PlacingSpec = env.task.family.spec
     rows = np.array([_errors_at_goal(env, index, find) for index in scenarios])
-    # Who measures a diameter calibrates it: what the median is off by is no error.
+    # A measured diameter is calibrated, so the error of the median does not count.
     rows[:, 2] = np.abs(rows[:, 2] - np.median(rows[:, 2]))
     tilt_deg, joint_height, image_height, image_lateral = np.percentile(rows, _PERCENTILE, axis=0)
     lateral = math.hypot(image_lateral, 1000.0 * spec.standoff_m * math.tan(math.radians(tilt_deg)))

@@ -1,4 +1,4 @@
-"""Certificate lines of holes: what sight tells of where they are, and what has to be felt."""
+"""Certificate lines of holes: how well vision shows them, and what has to be found by feel."""
 
 import math
 from collections.abc import Iterable
@@ -90,7 +90,7 @@ def check_sight(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
 
 
 def check_feeling(env: "Environment", scenarios: Iterable[int]) -> list[Check]:
-    """Can a hole that is off its paint be found by feel, by who knows nothing that is hidden?
+    """Can a hole that is off its paint be found by feel, without hidden knowledge?
 
     Args:
         env: The named task.

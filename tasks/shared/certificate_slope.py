@@ -1,4 +1,4 @@
-"""Certificate lines of surfaces whose slope and height have to be seen."""
+"""Certificate lines of surfaces of unknown slope and height."""
 
 import math
 from collections.abc import Iterable

@@ -1,8 +1,8 @@
 """Coloured discs in a picture: colour segmentation, then moments with sub-pixel edges.
 
-A plain classical method on purpose. The certificates use it to prove that a target can be seen: if
-it finds the disc under a variant's own light, colours, texture and noise, the picture holds what
-the task needs. The ``servo`` baseline uses it to solve the task.
+This is a plain classical method on purpose. The certificates use it to prove that a target can be
+seen: if it finds the disc under a variant's own light, colours, texture and noise, the picture
+contains what the task needs. The ``servo`` baseline uses it to solve the task.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""The environment loop: composer's contract with a lean step, addressable scenarios, kept renderer.
+"""The environment loop: composer's contract, a faster step, scenarios by index, one renderer.
 
 What differs from ``composer.Environment``, and why:
 
@@ -60,10 +60,10 @@ class Environment(composer.Environment):
 
     Attributes:
         clip_actions: Clip and count action values outside [-1, 1] instead of refusing them.
-        goal_ends_episode: False lets an episode go on past its goal to the time limit, so that one
-            can see where a policy settles. Never changes a scene.
-        draws: False leaves pictures out of the time steps, for those who do without or have
-            ``pictures`` draw them later. Never changes a scene.
+        goal_ends_episode: False lets an episode go on past its goal to the time limit, to show
+            where a policy settles. Never changes a scene.
+        draws: False leaves pictures out of the time steps, for callers that need none or draw them
+            later by ``pictures``. Never changes a scene.
 
     Args:
         task: The task.
@@ -247,7 +247,7 @@ class Environment(composer.Environment):
 
     @property
     def pending_setpoints(self) -> list[FloatArray]:
-        """True set points that were commanded and still wait out the latency, oldest first."""
+        """True set points that were commanded but do not act yet (latency), oldest first."""
         return self._arm.pending_setpoints()
 
     @property
@@ -333,8 +333,8 @@ class Environment(composer.Environment):
     def pictures(self, moments: Sequence[Moment]) -> dict[str, list[npt.NDArray[Any]]]:
         """Draw what the cameras showed at moments of this episode, exactly as observed then.
 
-        Who acts without looking gains by drawing later: an episode's pictures in one go take less
-        time than between physics and decisions, and so do those.
+        For a policy that does not look, drawing later is faster: all pictures of an episode at once
+        take less time than between physics and decisions.
 
         Args:
             moments: Of ``moment``, since the last reset.

@@ -1,4 +1,4 @@
-"""Families of tasks: what one has to say of itself, and the registry of those that there are.
+"""Families of tasks: what a family has to define, and the registry of families.
 
 A family is one class in one file. `ArmTask` plays it: arm, set points, latency, cameras, the count
 of held steps and the ends of an episode are the same for all. A family adds what is in the cell,
@@ -250,11 +250,12 @@ def registered() -> Mapping[str, Registered]:
 
 
 def discover() -> None:
-    """Import the families of others, which register their tasks.
+    """Import the families of other packages, which register their tasks.
 
     An installed package names its modules in the entry point group ``hvs_suite.families``; modules
-    to try are named, separated by commas, in the environment variable ``HVS_PLUGINS``, which
-    worker processes inherit. What cannot be imported is warned of: our own tasks do without it.
+    to try are named, separated by commas, in the environment variable ``HVS_PLUGINS``, which worker
+    processes inherit. A module that cannot be imported gives a warning, because the suite's own
+    tasks do not need it.
     """
     modules = [entry.value for entry in importlib.metadata.entry_points(group=ENTRY_POINTS)]
     modules += filter(None, os.environ.get(PLUGINS, "").split(","))
@@ -272,8 +273,9 @@ def import_family(module: str) -> None:
         OptionError: It cannot be imported.
     """
     try:
-        # Others import dm_control at the top; the OpenGL backend has to be chosen before that.
+        # Such modules import dm_control at the top; the OpenGL backend has to be chosen before
+        # that.
         importlib.import_module("hvs_suite.cell")
         importlib.import_module(module)
-    except (Exception, SystemExit) as error:  # somebody else's module raises anything
+    except (Exception, SystemExit) as error:  # a foreign module may raise anything
         raise OptionError(f"cannot import the tasks of {module}: {describe(error)}") from error

@@ -1,8 +1,8 @@
 """Feeling for a hole: a spiral search of the tip over a level face, by wrench and measured joints.
 
-A plain method on purpose, as `hvs_suite.tasks.shared.detection` is: the certificate uses it to
-prove that a hole can be found that no picture shows, the ``servo`` baseline to solve the task. It
-knows what is measured: where the tip is, and what the tool feels.
+This is a plain method on purpose, like `hvs_suite.tasks.shared.detection`. The certificate uses it
+to prove that a hole can be found although no picture shows it, and the ``servo`` baseline uses it
+to solve the task. It knows only measurements: where the tip is, and the wrench at the tool.
 
 The tip comes down until it is pressed against the face, then goes along an Archimedean spiral at a
 light, regulated force. Once it drops below the face it is in the mouth: it follows where the mouth

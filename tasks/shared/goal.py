@@ -27,7 +27,7 @@ class Goal:
         normal: Outward unit normal there, (3,); the tool's axis is its opposite.
         standoff_m: Distance that the tip keeps from the target along the normal (m).
         velocity: How fast the goal moves, (3,) m/s.
-        more_follow: Whether the arm goes on to another goal, of which nobody knows where it is.
+        more_follow: Whether the arm goes on to another goal, at a place that is not known yet.
     """
 
     target: FloatArray

@@ -1,4 +1,4 @@
-"""The version lock: what each task name means, as digests that the tests hold the code against.
+"""The version lock: digests of what each task name means, which the tests compare with the code.
 
 ``tasks/lock.json`` holds, for every named task, its version and the digests of what makes it: the
 parameters, the robot, the scene, the test scenarios and the rule of success. Changing what a name
@@ -134,7 +134,7 @@ def compute_entry(env: "Environment") -> LockEntry:
 
 
 def agreed_entry(env: "Environment") -> LockEntry:
-    """Compute what a task means now, and hold it against the lock.
+    """Compute what a task means now, and compare it with the lock.
 
     Args:
         env: The named task on its test split.

@@ -1,4 +1,4 @@
-"""Motions on the work surface: straight lines, and smooth curves that nobody can foresee."""
+"""Motions on the work surface: straight lines, and smooth curves that cannot be predicted."""
 
 import dataclasses
 import functools

@@ -1,7 +1,8 @@
 """What an option of a task may be, as the type of its field says it, and the same from text.
 
-The command line gives options as ``name=value``; JSON and Python give values. All are held against
-the types that the spec's fields declare, which is the only place where they are written down.
+The command line gives options as ``name=value``; JSON and Python give values. All are checked
+against the types that the spec's fields declare, which is the only place where they are written
+down.
 """
 
 import contextlib

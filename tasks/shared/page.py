@@ -1,8 +1,8 @@
 """The page of a named task, made from what the task says of itself.
 
-Nothing is written twice: the sentence, the bounds and the disturbances are the spec's, what is
-drawn is found out by drawing, what it means stands in the docstrings, and the certificate is the
-stored one. Only what makes a task hard is prose, and stands in the family's file.
+Nothing is written twice: the sentence, the bounds and the disturbances come from the spec, drawing
+scenarios shows what is random, the docstrings explain it, and the certificate is the stored one.
+Only the text on what makes a task hard is written for the page, in the family's file.
 """
 
 import dataclasses
@@ -49,10 +49,23 @@ def page(env: "Environment", certificate: Certificate, picture: str) -> str:
             "",
             f"![Start and goal of a scenario of {spec.name}, and its certificate]({picture})",
             "",
-            f"The arm starts: {words.start}. Target: {words.target}. Success: {words.tolerance}"
-            f"{held}. Time: {spec.time_limit_steps} control steps of "
-            f"{spec.control_period_s:g} s ({seconds:g} s). Disturbed: "
-            f"{'nothing' if words.disturbances == '-' else words.disturbances}.",
+            *_table(
+                ("", ""),
+                (
+                    ("start", words.start),
+                    ("target", words.target),
+                    ("success", f"{words.tolerance}{held}"),
+                    (
+                        "time",
+                        f"{spec.time_limit_steps} control steps of {spec.control_period_s:g} s "
+                        f"({seconds:g} s)",
+                    ),
+                    (
+                        "disturbances",
+                        "none" if words.disturbances == "-" else words.disturbances,
+                    ),
+                ),
+            ),
             "",
             "## What is hard about it",
             "",
@@ -66,11 +79,11 @@ def page(env: "Environment", certificate: Certificate, picture: str) -> str:
             "",
             *_table(("metric", "bound", "measured"), _measured(spec)),
             "",
-            "## What a policy sees, and says",
+            "## Observations and actions",
             "",
             *_table(("name", "shape", "type"), _shapes(env)),
             "",
-            "## What sets it apart",
+            "## Parameters",
             "",
             f"Parameters that differ from the defaults of family `{spec.family}`:",
             "",

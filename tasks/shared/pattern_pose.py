@@ -71,7 +71,7 @@ class RingPose:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RingFit:
-    """A pose, and how sure it is.
+    """A pose and its uncertainty.
 
     Attributes:
         pose: The pose.

@@ -1,7 +1,7 @@
 """A bushing with its hole, and the peg: their shape, what may touch, and how hard the peg presses.
 
-What is seen and what is met are two: the bushing, whose face is painted, and the hidden hole, which
-may be off it.
+What is seen and what is touched differ: the bushing with its painted face, and the hidden hole,
+which may be displaced from the paint.
 """
 
 import dataclasses
@@ -153,7 +153,7 @@ class PegAndBushing:
 
         data = physics.data.ptr
         data.mocap_pos[self._mocaps] = [painted, hole]
-        # The picture that follows shows where bodies were computed to be.
+        # The next picture shows the bodies where they were last computed.
         mujoco.mj_kinematics(physics.model.ptr, data)
         self._force = self.peak_n = self._felt_at_s = 0.0
 

@@ -1,4 +1,4 @@
-"""What the families share in which the tool is placed over a marker, facing it, at a distance.
+"""The common part of families that place the tool over a marker, facing it, at a distance.
 
 The marker is one small thing on the work surface, drawn within the ring that the arm reaches. What
 is measured is where the tool's tip stands over it and how far its axis is from the normal there.
@@ -224,7 +224,7 @@ class Placing[S: PlacingSpec, C: Scenario](Family[S, C]):
         model, data = physics.model.ptr, physics.data.ptr
         data.mocap_pos[self._mocap] = goal.target
         data.mocap_quat[self._mocap] = orientation(goal.normal)
-        # The picture that follows shows where bodies were computed to be.
+        # The next picture shows the bodies where they were last computed.
         mujoco.mj_kinematics(model, data)
 
     def measure(self, tip: Tip) -> dict[str, float]:

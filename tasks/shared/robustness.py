@@ -114,7 +114,7 @@ def common_axes(spec: "Spec") -> tuple[Axis, ...]:
             "joint-offset",
             "joint offsets",
             "what align-drill has, twice and four times that: 0.1 deg in one joint moves the tip "
-            "by 1.4 mm at a reach of 0.8 m, as in an arm that nobody calibrated",
+            "by 1.4 mm at a reach of 0.8 m, as in an arm that was not calibrated",
             "joint_offset_deg",
             (0.05, 0.1, 0.2),
             "{:g}°",
@@ -136,7 +136,7 @@ def replaced(axes: tuple[Axis, ...], axis: Axis) -> tuple[Axis, ...]:
 
 
 def target_size(diameter_m: float) -> Axis:
-    """A target that is smaller than policies believe.
+    """A target that is smaller than policies assume.
 
     Args:
         diameter_m: Of the named task's target (m).
@@ -153,7 +153,7 @@ def target_size(diameter_m: float) -> Axis:
 
 
 def unseen_marker() -> Axis:
-    """A marker that no training showed, where a task has the choice."""
+    """A marker that did not occur in training, where a task has the choice."""
     return Axis(
         "marker",
         "unseen marker",

@@ -89,7 +89,7 @@ class Timing:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Cameras:
-    """The eye in the hand (EIH) and the eye to hand (ETH), which looks on from above.
+    """The eye in the hand (EIH) and the eye to hand (ETH), a camera above the cell.
 
     Attributes:
         eih_resolution: Side of the square eye-in-hand image (px).
@@ -139,8 +139,9 @@ class Disturbances:
             640 px wide), which then have steps and holes as well; 0 for true depth.
         n_strewn: Things that lie around and are not the target: discs of other colours, red squares
             and half discs, as large as it is.
-        unannounced: The other options come as a surprise: the scenes are the named task's but for
-            what the options change in them, and policies are told the named task's parameters.
+        unannounced: Policies are not told of the other options: they get the named task's
+            parameters, and the scenes are the named task's except for what the options change in
+            them.
     """
 
     vary_light: bool = scene(False)
@@ -295,7 +296,7 @@ class Spec(Timing, Cameras, Disturbances):
             raise OptionError(f"discount is {self.discount}; use 0 to 1")
 
     def _check(self, rule: str, holds: typing.Callable[[float], bool], *names: str) -> None:
-        """Hold fields against a rule.
+        """Check fields by a rule.
 
         Args:
             rule: In words, after "it ".
@@ -317,7 +318,7 @@ class Spec(Timing, Cameras, Disturbances):
         self._check("cannot be negative", lambda value: value >= 0, *names)
 
     def _check_range(self, *names: str, least: float = 0.0, most: float = math.inf) -> None:
-        """Hold fields that are a least and a largest value against bounds.
+        """Check fields that are a least and a largest value against bounds.
 
         Raises:
             OptionError: A field breaks them.

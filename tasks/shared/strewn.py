@@ -1,7 +1,7 @@
 """Things strewn over the table that are not the target, for studies of any family.
 
-`clutter` is the family whose subject they are, with rules of its own. Here they come as a surprise:
-discs of other colours, and squares and half discs of the target's, as large as the target.
+The family `clutter` is about such things and has rules of its own. Here policies are not told of
+them: discs of other colours, and squares and half discs of the target's, as large as the target.
 """
 
 import math

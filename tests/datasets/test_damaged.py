@@ -29,7 +29,7 @@ def damaged(request, tmp_path):
 
 @pytest.fixture(scope="module", autouse=True)
 def one_environment():
-    """Loading a task takes longer than checking the sample; nobody closes what is shared."""
+    """Loading a task takes longer than checking the sample; what is shared is not closed."""
     with pytest.MonkeyPatch.context() as patched:
         make, made = MakeEnvironment.__call__, {}
 

@@ -35,7 +35,7 @@ def test_recipe_is_a_command_that_hvs_takes(task):
     assert program == "hvs"
     command = parse(words)
     assert command.task == task
-    # Policies are scored on the test split: nobody trains on it.
+    # Policies are scored on the test split, so none is trained on it.
     assert command.split == "train"
     dataset_features(hvs_suite.TASKS[task].with_options({"start": command.start}))
 

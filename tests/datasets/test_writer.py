@@ -27,7 +27,7 @@ pytestmark = pytest.mark.timeout(1800)
 
 
 def frames_of(features, length, random):
-    """Frames of an episode that nobody played: a shaded picture that drifts, and numbers."""
+    """Frames of an invented episode: a shaded picture that drifts, and numbers."""
     frames = []
     for step in range(length):
         frame = {}

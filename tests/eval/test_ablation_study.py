@@ -1,4 +1,4 @@
-"""What each choice buys: rows are trained without one thing each, and judged on the same scenes."""
+"""What each choice contributes: each row is trained without one, and scored on the same scenes."""
 
 import json
 from pathlib import Path

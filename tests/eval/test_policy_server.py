@@ -290,7 +290,7 @@ def hello(**changed: Any) -> dict[str, Any]:
         ("zero", {"task_digest": "0" * 64}, "another version of align-thesis"),
         ("zero", {"observations": {"eih": {"dtype": "object"}}}, "describes observations"),
         ("zero", {"action": None}, "describes observations"),
-        ("expert", {}, "looks behind the observations"),
+        ("expert", {}, "needs more than the observations"),
         ("nobody", {}, "neither a policy"),
         ("broken_policies:nothing", {}, "has no reset"),
     ],

@@ -1,5 +1,6 @@
 """Every block of docs/your-policy.md works: programs run, files play, commands end well."""
 
+import json
 import re
 import shlex
 import shutil
@@ -14,7 +15,7 @@ from hvs_suite.cli.main import run
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "your-policy.md").read_text("utf-8")
 SECTIONS = dict(re.findall(r"^## ([^\n]*)\n(.*?)(?=^## |\Z)", PAGE, re.MULTILINE | re.DOTALL))
-pytestmark = pytest.mark.timeout(300)
+pytestmark = pytest.mark.timeout(600)
 
 
 @pytest.fixture
@@ -57,6 +58,21 @@ def test_a_model_of_stable_baselines_is_trained_and_scored(folder):
     exec(training, {})
     [line] = commands("A model of Stable-Baselines3")
     assert run(shlex.split(line)[1:]) == 0
+
+
+def test_a_teacher_is_trained_and_demonstrates(folder, capsys):
+    training, _ = blocks("A teacher", "python")
+    exec(training, {})
+    for line in commands("A teacher"):
+        assert run(shlex.split(line)[1:]) == 0, line
+    for name, demonstrator in (("taught", "teacher:make"), ("bows", "my_policy:make")):
+        origin = json.loads((folder / "runs" / name / "hvs.json").read_text())
+        assert origin["demonstrator"] == demonstrator
+    notes = json.loads((folder / "runs/pupil/train_config.json").read_text())
+    assert notes["demonstrator"] == "teacher:make"
+    words = ["pretrain", "--data", "runs/taught", "--steps", "2", "--out", "runs/more"]
+    assert run([*words, "--dagger-rounds", "1"]) == 2
+    assert "recorded with teacher:make" in capsys.readouterr().err
 
 
 def test_a_policy_of_lerobot_plays_the_same_from_its_folder_and_by_its_code(folder, capsys):

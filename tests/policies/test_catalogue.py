@@ -59,6 +59,11 @@ def test_a_run_of_lerobot_train_is_told_where_its_policy_lies(tmp_path):
         policy_factory(str(tmp_path / "act"), "align-easy")
 
 
+def test_a_type_of_policy_is_told_where_lerobot_train_leaves_one():
+    with pytest.raises(PolicyError, match="RUN/checkpoints/last/pretrained_model"):
+        policy_factory("act", "align-easy")
+
+
 @pytest.mark.parametrize("spec", ["expert", "servo", "zero", "random"])
 def test_factories_travel_to_workers(spec):
     factory = policy_factory(spec, "align-easy")

@@ -231,7 +231,7 @@ def test_critics_see_where_a_command_leads(base, latency, from_set_point):
     led, went = (torch.sinh(torch.stack(each)) * scale for each in (foreseen, came))
     # What is foreseen comes as many steps later as there is latency.
     led, went = led[: len(led) - latency], went[latency:]
-    # Who foresaw the set point alone would be off by a third of the way.
+    # A critic that predicts the set point alone is wrong by a third of the way.
     astray, way = (led - went)[1:].norm(dim=1), went.diff(dim=0).norm(dim=1)
     assert way.mean() > 0.1
     assert astray.mean() < 0.03 * way.mean()

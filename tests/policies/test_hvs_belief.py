@@ -34,7 +34,7 @@ ENDS = (1, 11, 22)
 
 
 def new_policy(task: str):
-    """A policy for a task as nobody has trained it, its gates opened at random."""
+    """An untrained policy for a task, with its gates opened at random."""
     from lerobot.configs import FeatureType
     from lerobot.utils.feature_utils import dataset_to_policy_features
 

@@ -1,4 +1,4 @@
-"""Rehearsal: the head learns from frames whose images nobody looks at."""
+"""Rehearsal: the head learns from frames without their images."""
 
 import numpy as np
 import pytest

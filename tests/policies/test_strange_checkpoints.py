@@ -69,7 +69,7 @@ def with_step(folder: Path, processor: str, step: dict[str, Any]) -> None:
 
 
 def payloads(marker: Path) -> dict[str, dict[str, Any]]:
-    """Steps that would make a file, or run what nobody has looked at."""
+    """Steps that would make a file, or run unchecked code."""
     return {
         "Popen": {"class": "subprocess.Popen", "config": {"args": ["touch", str(marker)]}},
         "system": {"class": "os.system", "config": {"command": f"touch {marker}"}},

@@ -142,7 +142,7 @@ def test_it_goes_from_demonstrations_to_a_board_by_the_commands_of_the_page(
     # On a board of one's own our names may stand, but for our own policies alone.
     named = run("-c", _NAMES, "runs/results", path=installed, cwd=tmp_path)
     assert named.returncode == 0, named.stderr
-    # Who has not installed the package is told which task is missing.
+    # Without the package, the message says which task is missing.
     for words in ("check runs/shelf", "verify runs/results"):
         alone = hvs(*words.split(), path=tmp_path, cwd=tmp_path)
         assert alone.returncode != 0

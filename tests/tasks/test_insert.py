@@ -1,4 +1,4 @@
-"""Insert: a peg, its bushing, what may touch, how hard, and what nobody sees."""
+"""Insert: a peg, its bushing, what may touch, how hard, and what is hidden."""
 
 from typing import Any
 
