@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from hvs_suite.cli import console
 
 if TYPE_CHECKING:
-    from hvs_suite.policies.rl.run import Outcome
+    from hvs_suite.policies.rl.outcome import Outcome
 
 DEFAULT_MINUTES = 40.0
 

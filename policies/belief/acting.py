@@ -6,11 +6,14 @@ getting to them. Traced once and frozen, it is one call.
 
 import warnings
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from hvs_suite.policies.belief.eye import SIGHTING_SIZE
 from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
+from hvs_suite.policies.belief.residual import N_LENGTHS
 
 # TorchScript looks at what it runs before it settles how.
 _WARM_UP_CALLS = 3
@@ -40,6 +43,9 @@ def act(
     """
     sightings = network.look(images, goal)
     memory = network.remember(memory, sightings, state[:, :N_JOINTS])
+    if network.residual is not None:
+        memory, read = network.feel(memory, sightings, state, felt)
+        memory = network.move_goal(memory, network.residual(read))
     action = network.to_action(network.decide(memory, sightings, state, felt), memory)
     return action, network.commanded(memory, action)
 
@@ -65,16 +71,7 @@ class CompiledBelief:
             torch.zeros(1, shape.n_goals),
             torch.zeros(1, shape.n_felt),
         )
-        with torch.no_grad(), warnings.catch_warnings():
-            # Tracing holds for batches of one alone, which is all it is made for; and newer Python
-            # will want another compiler, which needs a C++ one installed.
-            warnings.simplefilter("ignore")
-            traced = torch.jit.trace(  # type: ignore[no-untyped-call]
-                _Acts(network).eval(), example, check_trace=False
-            )
-            self._frozen = torch.jit.freeze(traced)
-            for _ in range(_WARM_UP_CALLS):
-                self._frozen(*example)
+        self._frozen = _compiled(_Acts(network), example)
 
     def __call__(
         self,
@@ -126,3 +123,116 @@ class _Acts(nn.Module):
             goal if shape.n_goals else None,
             felt if shape.n_felt else None,
         )
+
+
+class CompiledParts:
+    """Plays a network with a residual, whose place somebody else takes; one observation at a time.
+
+    Args:
+        network: In evaluation mode; later changes of its weights are not noticed.
+    """
+
+    def __init__(self, network: BeliefNetwork) -> None:
+        assert network.residual is not None
+        shape = network.shape
+        self._cameras = tuple(shape.cameras)
+        self._nothing = torch.zeros(1, 0)
+        images = tuple(torch.zeros(1, c, side, side) for c, side in shape.cameras.values())
+        state, memory = torch.zeros(1, 2 * N_JOINTS), network.start(1)
+        goal, felt = torch.zeros(1, shape.n_goals), torch.zeros(1, shape.n_felt)
+        sightings = tuple(torch.zeros(1, SIGHTING_SIZE) for _ in self._cameras)
+        share = torch.zeros(1, N_LENGTHS)
+        self._perceives = _compiled(_Perceives(network), (images, state, memory, goal, felt))
+        self._responds = _compiled(_Responds(network), (memory, sightings, state, share, felt))
+
+    def perceive(
+        self,
+        images: Mapping[str, Tensor],
+        state: Tensor,
+        memory: Tensor,
+        goal: Tensor | None,
+        felt: Tensor | None,
+    ) -> tuple[Tensor, tuple[Tensor, ...], Tensor]:
+        """Take an observation in, all arguments as in `act`.
+
+        Returns:
+            The memory with it, the sightings, and what the residual reads.
+        """
+        return self._perceives(
+            tuple(images[name] for name in self._cameras),
+            state,
+            memory,
+            self._nothing if goal is None else goal,
+            self._nothing if felt is None else felt,
+        )
+
+    def respond(
+        self,
+        memory: Tensor,
+        sightings: tuple[Tensor, ...],
+        state: Tensor,
+        share: Tensor,
+        felt: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:
+        """Move the goal by shares (1, 3) of the largest step, and decide; what `act` returns."""
+        return self._responds(
+            memory, sightings, state, share, self._nothing if felt is None else felt
+        )
+
+
+class _Perceives(nn.Module):
+    """The first half of `act`, as tracing takes it."""
+
+    def __init__(self, network: BeliefNetwork) -> None:
+        super().__init__()
+        self._network = network
+
+    def forward(
+        self, images: tuple[Tensor, ...], state: Tensor, memory: Tensor, goal: Tensor, felt: Tensor
+    ) -> tuple[Tensor, tuple[Tensor, ...], Tensor]:
+        """The memory, the sightings, and what the residual reads."""
+        network, shape = self._network, self._network.shape
+        seen = dict(zip(shape.cameras, images, strict=True))
+        sightings = network.look(seen, goal if shape.n_goals else None)
+        memory = network.remember(memory, sightings, state[:, :N_JOINTS])
+        memory, read = network.feel(memory, sightings, state, felt if shape.n_felt else None)
+        return memory, tuple(sightings.values()), read
+
+
+class _Responds(nn.Module):
+    """The second half of `act`, as tracing takes it."""
+
+    def __init__(self, network: BeliefNetwork) -> None:
+        super().__init__()
+        self._network = network
+
+    def forward(
+        self,
+        memory: Tensor,
+        sightings: tuple[Tensor, ...],
+        state: Tensor,
+        share: Tensor,
+        felt: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """The action, and the next memory."""
+        network, shape = self._network, self._network.shape
+        seen = dict(zip(shape.cameras, sightings, strict=True))
+        memory = network.move_goal(memory, share)
+        out = network.decide(memory, seen, state, felt if shape.n_felt else None)
+        action = network.to_action(out, memory)
+        return action, network.commanded(memory, action)
+
+
+def _compiled(module: nn.Module, example: tuple[Any, ...]) -> Any:
+    """A module, traced and frozen."""
+    with torch.no_grad(), warnings.catch_warnings():
+        # Tracing holds for batches of one alone, which is all it is made for; and newer Python
+        # will want another compiler, which needs a C++ one installed.
+        warnings.simplefilter("ignore")
+        traced = torch.jit.trace(  # type: ignore[no-untyped-call]
+            module.eval(), example, check_trace=False
+        )
+        frozen = torch.jit.freeze(traced)
+        for _ in range(_WARM_UP_CALLS):
+            frozen(*example)
+    return frozen

@@ -33,6 +33,7 @@ from hvs_suite.policies.belief.belief import (
     View,
 )
 from hvs_suite.policies.belief.eye import LOG_DIAMETER, UV, VISIBLE, Eye
+from hvs_suite.policies.belief.residual import RESIDUAL_SIZE, SHIFT, Residual, goal_axes
 from hvs_suite.policies.network import geometry
 from hvs_suite.policies.network.geometry import FlangeMotion
 
@@ -82,6 +83,11 @@ class Shape:
         hidden: Width of the head.
         error_scale: Below it errors weigh linearly, above logarithmically: joint steps (rad) and
             places (m).
+        residual_hidden: Width of the residual; 0 for none.
+        residual_step_m: The most that it moves the goal in a step: sideways, and along the normal
+            (m).
+        residual_reach_m: How far from the believed goal the tip may be for the goal to be moved
+            (m).
     """
 
     cameras: Mapping[str, tuple[int, int]]
@@ -90,12 +96,27 @@ class Shape:
     channels: int = 32
     hidden: int = 256
     error_scale: float = 0.005
+    residual_hidden: int = 0
+    residual_step_m: tuple[float, float] = (0.0004, 0.001)
+    residual_reach_m: float = 0.02
 
 
 MEMORY_SIZE = BELIEF_SIZE + N_JOINTS + 1 + RECENT_SIZE
 SET_POINT = slice(BELIEF_SIZE, BELIEF_SIZE + N_JOINTS)
 BEGUN = slice(BELIEF_SIZE + N_JOINTS, BELIEF_SIZE + N_JOINTS + 1)
 RECENT = slice(BELIEF_SIZE + N_JOINTS + 1, MEMORY_SIZE)
+FELT = slice(MEMORY_SIZE, MEMORY_SIZE + RESIDUAL_SIZE)
+"""Where what the residual remembers stands, in networks that have one."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Place:
+    """The tip, measured and as it was sent, and where its goal is taken to be (m)."""
+
+    here: FlangeMotion
+    sent: FlangeMotion
+    goal: Tensor
+    normal: Tensor
 
 
 class BeliefNetwork(nn.Module):
@@ -162,6 +183,15 @@ class BeliefNetwork(nn.Module):
             nn.SiLU(),
             last,
         )
+        self.residual: Residual | None = None
+        if shape.residual_hidden:
+            self.residual = Residual(
+                width,
+                shape.residual_hidden,
+                shape.residual_step_m,
+                shape.residual_reach_m,
+                cell.period_s,
+            )
 
     # --- the cell ---
 
@@ -199,7 +229,8 @@ class BeliefNetwork(nn.Module):
 
     def start(self, n: int) -> Tensor:
         """The memory at the beginning of an episode, (n, k) float64."""
-        memory = torch.zeros(n, MEMORY_SIZE, dtype=torch.float64)
+        size = MEMORY_SIZE if self.residual is None else FELT.stop
+        memory = torch.zeros(n, size, dtype=torch.float64)
         memory[:, :BELIEF_SIZE] = self.belief.start(n)
         memory[:, RECENT] = 1.0
         return memory
@@ -236,8 +267,52 @@ class BeliefNetwork(nn.Module):
         # Not seen since it was last forgotten: 1; falls to 0 when it is seen.
         unseen = torch.maximum(recent[:, :2], forget) * (1.0 - seen)
         away = (1.0 - seen) * (recent[:, 2:] * 0.9 + 0.1)
-        return torch.cat(
-            [believed, set_point, torch.ones_like(set_point[:, :1]), unseen, away], dim=1
+        begun = torch.ones_like(set_point[:, :1])
+        return torch.cat([believed, set_point, begun, unseen, away, memory[:, MEMORY_SIZE:]], dim=1)
+
+    def feel(
+        self,
+        memory: Tensor,
+        sightings: Mapping[str, Tensor],
+        state: Tensor,
+        felt: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Take what was felt into the memory of a network with a residual.
+
+        Args:
+            memory: (B, k), with this observation in it.
+            sightings: Camera name to (B, 9).
+            state: (B, 14).
+            felt: Wrench at the tip, (B, 6); None without.
+
+        Returns:
+            (B, k), and what the residual reads, (B, n).
+        """
+        assert self.residual is not None
+        place = self._place(memory, state[:, :N_JOINTS])
+        read = self._head_inputs(memory, sightings, state, felt, place)
+        part = self.residual.remember(
+            memory[:, FELT], place.here.position, place.sent.position, felt
+        )
+        goal, axes = self.goal_frame(memory)
+        return torch.cat([memory[:, :MEMORY_SIZE], part], dim=1), self.residual.inputs(
+            part, read, goal, axes
+        )
+
+    def move_goal(self, memory: Tensor, share: Tensor) -> Tensor:
+        """Move the goal by a share (B, 3) of the residual's largest step; after `feel`."""
+        assert self.residual is not None
+        part = self.residual.move(memory[:, FELT], share, *self.goal_frame(memory))
+        return torch.cat([memory[:, :MEMORY_SIZE], part], dim=1)
+
+    def goal_frame(self, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Where the goal is believed to be, not moved (B, 3) m, and its axes (B, 3, 3), float64."""
+        believed = memory[:, :BELIEF_SIZE]
+        normal = self.belief.normal(believed)
+        sent = geometry.flange_motion(memory[:, SET_POINT])
+        return (
+            believed[:, PLACE] + self.belief.standoff * normal,
+            goal_axes(sent.rotation, normal),
         )
 
     def commanded(self, memory: Tensor, action: Tensor) -> Tensor:
@@ -265,31 +340,11 @@ class BeliefNetwork(nn.Module):
             felt: Wrench at the tip, (B, 6); None without.
         """
         scale = self.shape.error_scale
-        q, velocity = state[:, :N_JOINTS], state[:, N_JOINTS:]
+        place = self._place(memory, state[:, :N_JOINTS])
+        here, sent, goal, normal = place.here, place.sent, place.goal, place.normal
         set_point = memory[:, SET_POINT].float()
-        pending = set_point - q
-        here = arm.tip_of(geometry.flange_motion(q), self.cell.tool_length_m)
-        sent = arm.tip_of(geometry.flange_motion(set_point), self.cell.tool_length_m)
-        believed = memory[:, :BELIEF_SIZE]
-        goal, normal = self._goal(memory)
-        speed = believed[:, VELOCITY].float()
-        bend = believed[:, ACCELERATION].float()
-        P = believed[:, COVARIANCE].view(-1, N_MOTION, N_MOTION)
-        stds = torch.diagonal(P, dim1=1, dim2=2).clamp(min=1e-14).sqrt().float()
-        tilt_std = believed[:, TILT_VARIANCE].sqrt().float()
-        features = [torch.sin(q), torch.cos(q), q / self.joint_range, velocity / self.joint_speed]
-        features.append(torch.asinh(pending / scale))
-        for s in sightings.values():
-            features += [torch.tanh(s[:, VISIBLE] / 4.0), s[:, UV].clamp(-2, 2)]
-            features.append(0.3 * s[:, LOG_DIAMETER])
-        features.append(memory[:, RECENT].float())
-        features += [0.3 * torch.log(stds), 0.3 * torch.log(tilt_std), 10.0 * speed, 5.0 * bend]
-        features.append(normal[:, :2])
-        for tip in (here, sent):
-            features.append(self._in_goal_frame(tip, goal, normal))
-        if felt is not None:
-            features += [felt / 20.0, torch.asinh(felt / 0.5)]
-        inputs = torch.cat(features, dim=1)
+        speed, bend = memory[:, VELOCITY].float(), memory[:, ACCELERATION].float()
+        inputs = self._head_inputs(memory, sightings, state, felt, place)
         # The point by the goal, its sideways axes those of the tool.
         guided = self.guide(inputs)
         bound = math.asinh(0.3 / scale)
@@ -321,6 +376,45 @@ class BeliefNetwork(nn.Module):
         mean = (weights.softmax(dim=1)[:, :, None] * torch.stack(proposals, dim=1)).sum(dim=1)
         total = torch.asinh(mean / scale) + torch.sigmoid(is_corrected) * correction
         return total
+
+    def _place(self, memory: Tensor, q: Tensor) -> _Place:
+        """Where the tip is by measured joints (B, 7) and set point, and where it has to go."""
+        here, sent = (
+            arm.tip_of(geometry.flange_motion(each), self.cell.tool_length_m)
+            for each in (q, memory[:, SET_POINT].float())
+        )
+        return _Place(here, sent, *self._goal(memory))
+
+    def _head_inputs(
+        self,
+        memory: Tensor,
+        sightings: Mapping[str, Tensor],
+        state: Tensor,
+        felt: Tensor | None,
+        place: _Place,
+    ) -> Tensor:
+        """What the head reads of the observation and of what is remembered, (B, `width`)."""
+        scale = self.shape.error_scale
+        q, velocity = state[:, :N_JOINTS], state[:, N_JOINTS:]
+        pending = memory[:, SET_POINT].float() - q
+        believed = memory[:, :BELIEF_SIZE]
+        speed, bend = believed[:, VELOCITY].float(), believed[:, ACCELERATION].float()
+        P = believed[:, COVARIANCE].view(-1, N_MOTION, N_MOTION)
+        stds = torch.diagonal(P, dim1=1, dim2=2).clamp(min=1e-14).sqrt().float()
+        tilt_std = believed[:, TILT_VARIANCE].sqrt().float()
+        features = [torch.sin(q), torch.cos(q), q / self.joint_range, velocity / self.joint_speed]
+        features.append(torch.asinh(pending / scale))
+        for s in sightings.values():
+            features += [torch.tanh(s[:, VISIBLE] / 4.0), s[:, UV].clamp(-2, 2)]
+            features.append(0.3 * s[:, LOG_DIAMETER])
+        features.append(memory[:, RECENT].float())
+        features += [0.3 * torch.log(stds), 0.3 * torch.log(tilt_std), 10.0 * speed, 5.0 * bend]
+        features.append(place.normal[:, :2])
+        for tip in (place.here, place.sent):
+            features.append(self._in_goal_frame(tip, place.goal, place.normal))
+        if felt is not None:
+            features += [felt / 20.0, torch.asinh(felt / 0.5)]
+        return torch.cat(features, dim=1)
 
     def _in_goal_frame(self, tip: FlangeMotion, goal: Tensor, normal: Tensor) -> Tensor:
         """Where a tip is by the goal, along tool and normal, and how tilted it is, (B, 8)."""
@@ -376,6 +470,8 @@ class BeliefNetwork(nn.Module):
         believed = memory[:, :BELIEF_SIZE]
         normal = self.belief.normal(believed)
         goal = believed[:, PLACE] + self.belief.standoff * normal
+        if self.residual is not None:
+            goal = goal + memory[:, FELT][:, SHIFT]
         return goal.float(), normal.float()
 
     def encode_label(self, action: Tensor, memory: Tensor) -> Tensor:

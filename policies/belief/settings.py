@@ -27,6 +27,7 @@ Coordinate = Annotated[float, pydantic.Field(strict=True, ge=-10.0, le=10.0)]
 Cosine = Annotated[float, pydantic.Field(strict=True, ge=-1.0 - 1e-9, le=1.0 + 1e-9)]
 Tangent = Annotated[float, pydantic.Field(strict=True, ge=0.01, le=100.0)]
 Period = Annotated[float, pydantic.Field(strict=True, ge=1e-3, le=10.0)]
+StepLength = Annotated[float, pydantic.Field(strict=True, gt=0.0, le=0.1)]
 Place = tuple[Coordinate, Coordinate, Coordinate]
 Axes = tuple[tuple[Cosine, Cosine, Cosine], tuple[Cosine, Cosine, Cosine],
              tuple[Cosine, Cosine, Cosine]]  # fmt: skip
@@ -80,6 +81,9 @@ class Settings(pydantic.BaseModel):
         wrench_key: Input that holds force and torque, (6,); None without.
         control_period_s: Has to be that of the cell.
         cell: What is known of the cell.
+        residual_hidden: See `Shape`.
+        residual_step_m: See `Shape`.
+        residual_reach_m: See `Shape`.
     """
 
     model_config = pydantic.ConfigDict(extra="ignore")
@@ -92,6 +96,11 @@ class Settings(pydantic.BaseModel):
     wrench_key: Annotated[str, pydantic.StringConstraints(strict=True, max_length=100)] | None
     control_period_s: Period
     cell: Cell
+    residual_hidden: Annotated[int, pydantic.Field(strict=True, ge=0, le=_MOST_SIZE)] = 0
+    residual_step_m: tuple[StepLength, StepLength] = Shape.residual_step_m
+    residual_reach_m: Annotated[float, pydantic.Field(strict=True, gt=0.0, le=10.0)] = (
+        Shape.residual_reach_m
+    )
 
     @pydantic.model_validator(mode="after")
     def _fit(self) -> "Settings":
@@ -139,6 +148,9 @@ class Settings(pydantic.BaseModel):
             channels=self.channels,
             hidden=self.hidden,
             error_scale=self.error_scale,
+            residual_hidden=self.residual_hidden,
+            residual_step_m=self.residual_step_m,
+            residual_reach_m=self.residual_reach_m,
         )
 
     def network(self) -> BeliefNetwork:

@@ -92,7 +92,7 @@ def describe(
         command: As in `write_card`.
     """
     settings = trained["settings"]
-    was_fine_tuned = "bound" in settings
+    was_fine_tuned = "base" in settings
     inputs = ", ".join(
         f"`{key}` {' x '.join(map(str, value['shape']))}"
         for key, value in sorted(config["input_features"].items())
@@ -167,7 +167,7 @@ def _imitation_rows(trained: Mapping[str, Any], outcome: Mapping[str, Any]) -> d
 
 def _rl_rows(settings: Mapping[str, Any], outcome: Mapping[str, Any]) -> dict[str, str]:
     """What `finetune` did."""
-    looked = settings["eye_rounds"] * settings["eye_frames"]
+    looked = settings.get("eye_rounds", 0) * settings.get("eye_frames", 0)
     return {
         "fine-tuned from": f"a pretrained policy, weights `{settings['base'][:12]}`",
         "eyes": f"{looked:,} frames of the policy's own episodes" if looked else "as they were",

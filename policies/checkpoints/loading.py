@@ -9,7 +9,7 @@ import dataclasses
 import hashlib
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -183,6 +183,38 @@ def network_inputs(
     return _one(network, as_batch(observation, keys))
 
 
+class BeliefInputs(NamedTuple):
+    """An observation as `hvs_suite.policies.belief.acting.act` takes it, a batch of one."""
+
+    images: dict[str, Tensor]
+    state: Tensor
+    goal: Tensor | None
+    felt: Tensor | None
+
+
+def belief_inputs(
+    network: BeliefNetwork, config: Mapping[str, Any], observation: Observation
+) -> BeliefInputs:
+    """An observation as a `BeliefNetwork` takes it.
+
+    Args:
+        network: Its shape says what it looks at.
+        config: Of its checkpoint, which says what else it reads.
+        observation: As in `CheckpointPolicy.select_action`.
+    """
+    return _belief_inputs(network, config, as_batch(observation, config["input_features"]))
+
+
+def _belief_inputs(network: BeliefNetwork, config: Mapping[str, Any], batch: Batch) -> BeliefInputs:
+    goal, wrench = config["goal_key"], config["wrench_key"]
+    return BeliefInputs(
+        {name: batch[IMAGE_PREFIX + name][None] for name in network.shape.cameras},
+        batch[STATE][None],
+        None if goal is None else batch[goal][None],
+        None if wrench is None else batch[wrench][None],
+    )
+
+
 def _one(
     network: HvsNetwork, batch: Mapping[str, Tensor]
 ) -> tuple[dict[str, Tensor], Tensor | None]:
@@ -347,16 +379,10 @@ def _belief(folder: Path, config: Mapping[str, Any]) -> Player:
     """Play the network of an `hvs_belief` checkpoint by itself."""
     network = load_belief_network(folder)
     compiled = CompiledBelief(network)
-    goal, wrench = config["goal_key"], config["wrench_key"]
 
     def step(batch: Batch, memory: Tensor | None) -> tuple[Tensor, Tensor]:
-        return compiled(
-            {name: batch[IMAGE_PREFIX + name][None] for name in network.shape.cameras},
-            batch[STATE][None],
-            memory,
-            None if goal is None else batch[goal][None],
-            None if wrench is None else batch[wrench][None],
-        )
+        inputs = _belief_inputs(network, config, batch)
+        return compiled(inputs.images, inputs.state, memory, inputs.goal, inputs.felt)
 
     return _remembering(step)
 

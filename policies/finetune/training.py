@@ -41,7 +41,8 @@ from hvs_suite.policies.finetune.stage import MakeStage
 from hvs_suite.policies.network.network import N_JOINTS, HvsNetwork
 from hvs_suite.policies.rl.curriculum import Kind, levels_of
 from hvs_suite.policies.rl.evaluation import Evaluation, Evaluator
-from hvs_suite.policies.rl.run import Outcome, Progress, Run, check_run
+from hvs_suite.policies.rl.outcome import Outcome, Progress, check_run
+from hvs_suite.policies.rl.run import Run
 from hvs_suite.policies.training.budget import Budget
 from hvs_suite.policies.training.process import prepare_process
 from hvs_suite.policies.training.run_folder import claimed, write_train_config

@@ -7,7 +7,7 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 
 from hvs_suite.errors import PolicyError
-from hvs_suite.policies.belief.network import N_JOINTS
+from hvs_suite.policies.belief.network import N_JOINTS, Shape
 from hvs_suite.policies.belief.settings import Settings, further_keys
 from hvs_suite.policies.trained_for import CONTROL_PERIOD_S, FAMILY
 from hvs_suite.reading import validated
@@ -34,6 +34,10 @@ class HvsBeliefConfig(PreTrainedConfig):
             takes ``observation.wrench`` if that is one of its inputs.
         cell: What is known of the cell beforehand, as `hvs_suite.policies.belief.settings.Cell`
             has it; None for a new policy, which takes that of its dataset's task.
+        residual_hidden: Width of the residual that RL has learned; 0 without one.
+        residual_step_m: The most that it moves the goal in a step: sideways, and along the normal
+            (m).
+        residual_reach_m: How far from the believed goal it does (m).
         family: Family of the tasks that it was trained for.
         control_period_s: Length of their control step (s).
         options: Options of the task that it was trained with, where they differ from the named one;
@@ -57,6 +61,9 @@ class HvsBeliefConfig(PreTrainedConfig):
     goal_key: str | None = None
     wrench_key: str | None = None
     cell: dict[str, Any] | None = None
+    residual_hidden: int = 0
+    residual_step_m: tuple[float, float] = Shape.residual_step_m
+    residual_reach_m: float = Shape.residual_reach_m
     family: str = FAMILY
     control_period_s: float = CONTROL_PERIOD_S
     options: dict[str, Any] = field(default_factory=dict)

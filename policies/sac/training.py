@@ -18,7 +18,8 @@ from stable_baselines3 import SAC
 from hvs_suite.errors import OptionError
 from hvs_suite.policies.rl.evaluation import Evaluator
 from hvs_suite.policies.rl.journal import Journal, make_journal
-from hvs_suite.policies.rl.run import Outcome, Progress, Run, check_run
+from hvs_suite.policies.rl.outcome import Outcome, Progress, check_run
+from hvs_suite.policies.rl.run import Run
 from hvs_suite.policies.sac.network import policy_kwargs
 from hvs_suite.policies.sac.playing import GreedyActor, save_actor, write_config
 from hvs_suite.policies.sac.settings import Settings

@@ -33,6 +33,7 @@ from hvs_suite.policies.finetune.stage import (
 from hvs_suite.policies.finetune.training import finetune
 from hvs_suite.policies.imitation.pretrain import pretrain
 from hvs_suite.policies.network.network import CONTROL_PERIOD_S, SET_POINT
+from hvs_suite.policies.residual.settings import Settings as ResidualSettings
 from hvs_suite.policies.rl.evaluation import Evaluation, fallen
 from hvs_suite.policies.rl.journal import Journal
 from hvs_suite.rollout import run_episode
@@ -419,12 +420,12 @@ def test_settings_that_make_no_sense_are_refused(setting):
         Settings(**setting)
 
 
-def test_the_command_has_the_defaults_of_the_method():
+def test_the_command_leaves_to_the_method_what_is_not_given():
     command = {field.name: field.default for field in dataclasses.fields(Finetune)}
-    method = {field.name: field.default for field in dataclasses.fields(Settings)}
-    shared = command.keys() & method.keys()
-    assert "warm_up_steps" in shared
-    assert {name: command[name] for name in shared} == {name: method[name] for name in shared}
+    for method in (Settings, ResidualSettings):
+        shared = command.keys() & {field.name for field in dataclasses.fields(method)}
+        assert "warm_up_steps" in shared
+        assert {command[name] for name in shared} == {None}
 
 
 def test_what_cannot_be_fine_tuned_is_refused(whole, base, tmp_path, capsys):

@@ -1,0 +1,266 @@
+"""What the residual learns in: the imitated policy plays, and an action moves its goal.
+
+Pictures never leave the process that plays: what goes into the replay memory is what the frozen
+eyes, the belief and the arm's geometry made of them. As long as the tip is far from the goal no
+action has an effect (`hvs_suite.policies.belief.residual`), so the policy flies there by itself,
+and an episode begins with the first step in which one has.
+
+Critics also see what only the simulator knows; the actor, which has to do without in the end, does
+not.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+import torch
+from gymnasium import spaces
+from torch import Tensor
+
+from hvs_suite.errors import PolicyError
+from hvs_suite.policies.belief.acting import CompiledParts
+from hvs_suite.policies.belief.network import FELT
+from hvs_suite.policies.belief.residual import FINE_M, N_LENGTHS, SHIFT
+from hvs_suite.policies.checkpoints.files import read_config
+from hvs_suite.policies.checkpoints.loading import belief_inputs
+from hvs_suite.policies.residual.folding import load_base, with_residual
+from hvs_suite.policies.residual.settings import Settings
+from hvs_suite.registry import find, load
+from hvs_suite.rollout import one_torch_thread
+
+READ = "read"
+"""Key of what the actor reads."""
+PRIVILEGED = "privileged"
+"""Key of what only the critics do, see `Stage`."""
+SCENES_A_SEED = 10**9
+"""Runs with different seeds learn from different scenes."""
+MOST_FLIGHTS = 20
+"""Scenes in a row in which the tip may come near no goal."""
+SOON_S = 0.2
+"""The goal's way in this time is what critics know of its motion."""
+
+Observation = dict[str, npt.NDArray[np.float32]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """How far a player has come: all that it takes to put it back there.
+
+    Attributes:
+        episode: Number of the episode.
+        actions: Since it began, (3,) each.
+        played: Control steps of all episodes.
+    """
+
+    episode: int = 0
+    actions: Sequence[Sequence[float]] = ()
+    played: int = 0
+
+
+class Stage(gymnasium.Env[Any, Any]):
+    """Plays one scene of a split after the other.
+
+    Observations are ``read``, what `Residual` reads, and ``privileged``: how far the tip is from
+    the goal, how far the goal is from where it is believed to be after having been moved, and how
+    it will move (3 each, in the goal's frame, logarithmic), what is left of the time, for how long
+    the goal was held, and each error over its bound. An action is three shares in [-1, 1].
+
+    The reward is the task's, less the cost of a step, and a potential beside it that changes no
+    best policy (Ng, Harada and Russell, 1999): gamma * phi(s') - phi(s), with phi(s) = -weight *
+    sum of asinh(error / tolerance) over the errors that the task bounds, and 0 at the end of an
+    episode.
+
+    ``info`` counts episodes and all control steps, those of the flights included; at the end of an
+    episode it says how it ended.
+
+    Args:
+        make: What to play.
+    """
+
+    def __init__(self, make: "MakeStage") -> None:
+        self._make = make
+        folder = Path(make.folder)
+        self._config = read_config(folder)
+        self._env = load(make.task, split=make.split, **make.options)
+        with one_torch_thread():
+            settings = make.settings
+            self._network = with_residual(load_base(folder), settings)
+            self._parts = CompiledParts(self._network)
+        assert self._network.residual is not None
+        spec = self._env.spec
+        self._bounds = make.bounds
+        self._step_bounds = spec.step_bounds
+        self._place = make.place
+        self._episode, self._played = make.place.episode, make.place.played
+        self._potential = self._return = 0.0
+        self._length = 0
+        self._memory: Tensor
+        sizes = {
+            READ: self._network.residual.n_inputs,
+            PRIVILEGED: make.n_privileged,
+        }
+        self.observation_space = spaces.Dict(
+            {k: spaces.Box(-np.inf, np.inf, (size,), np.float32) for k, size in sizes.items()}
+        )
+        self.action_space = spaces.Box(-1.0, 1.0, (N_LENGTHS,), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin the next episode, or at first go to where `MakeStage.place` says.
+
+        Args:
+            seed: Not used; the scenes are the run's own.
+            options: Not used.
+        """
+        self._fly()
+        for action in self._place.actions:
+            self._play(np.array(action, np.float32))
+        # The flight there was counted already.
+        self._played = self._place.played or self._played
+        self._place = Place()
+        return self._observation(), self._counts()
+
+    def step(
+        self, action: npt.NDArray[np.float32]
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Play a control step in which the goal is moved."""
+        before = self._potential
+        over = self._play(action)
+        info = self._env.info
+        after = 0.0 if over else self._potential
+        reward = self._reward - self._make.settings.step_cost
+        reward += self._make.settings.gamma * after - before
+        ends: dict[str, Any] = {}
+        if over:
+            self._episode += 1
+            ends = {
+                "success": float(info["is_success"]),
+                "collision": float(info["collision"]),
+                "return": self._return,
+                "length": float(self._length),
+            }
+        return self._observation(), reward, over, False, {**self._counts(), **ends}
+
+    def close(self) -> None:
+        """Free the environment."""
+        self._env.close()
+
+    def _counts(self) -> dict[str, Any]:
+        return {"episode": self._episode, "played": self._played}
+
+    def _fly(self) -> None:
+        """Play scenes until an action has an effect; mostly that is in the first of them.
+
+        Raises:
+            PolicyError: In many there is none.
+        """
+        make = self._make
+        for _ in range(MOST_FLIGHTS):
+            scenario = make.seed * SCENES_A_SEED + make.part
+            scenario += make.settings.environments * self._episode
+            self._memory = self._network.start(1)
+            self._return, self._length = 0.0, 0
+            over = False
+            self._look(self._env.reset(scenario=scenario).observation)
+            while not over and not self._is_near():
+                over = self._play(np.zeros(N_LENGTHS, np.float32))
+            if not over:
+                return
+            self._episode += 1
+        raise PolicyError(
+            f"{make.folder} came within {make.settings.reach_m:g} m of the goal in none of "
+            f"{MOST_FLIGHTS} scenes of {make.task}, so there is nothing to fine-tune"
+        )
+
+    def _play(self, action: npt.NDArray[np.float32]) -> bool:
+        """One control step; whether it was the last of the episode."""
+        with one_torch_thread(), torch.inference_mode():
+            share = torch.from_numpy(action)[None]
+            command, self._memory = self._parts.respond(
+                self._memory, self._sightings, self._inputs.state, share, self._inputs.felt
+            )
+        time_step = self._env.step(command[0].numpy())
+        self._reward = float(time_step.reward or 0.0)
+        self._return += self._reward
+        self._length += 1
+        self._played += 1
+        self._look(time_step.observation)
+        return bool(time_step.last())
+
+    def _look(self, observation: Mapping[str, npt.NDArray[Any]]) -> None:
+        self._inputs = inputs = belief_inputs(self._network, self._config, observation)
+        with one_torch_thread(), torch.inference_mode():
+            self._memory, self._sightings, self._read = self._parts.perceive(
+                inputs.images, inputs.state, self._memory, inputs.goal, inputs.felt
+            )
+        errors = self._env.info["errors"]
+        relative = [errors[name] / bound for name, bound in self._step_bounds.items()]
+        self._potential = -self._make.settings.shaping * float(np.arcsinh(relative).sum())
+
+    def _is_near(self) -> bool:
+        residual = self._network.residual
+        assert residual is not None
+        goal, _ = self._network.goal_frame(self._memory)
+        return bool(residual.is_near(self._memory[:, FELT], goal))
+
+    def _observation(self) -> Observation:
+        env = self._env
+        believed, axes = (each[0].numpy() for each in self._network.goal_frame(self._memory))
+        believed = believed + self._memory[0, FELT][SHIFT].numpy()
+        goal, coming = env.goal().position, env.goal(SOON_S).position
+        ways = np.concatenate([goal - env.tip().position, goal - believed, coming - goal])
+        info, spec = env.info, env.spec
+        privileged = [
+            np.arcsinh(ways.reshape(3, 3) @ axes / FINE_M).reshape(-1),
+            [1.0 - env.control_steps / spec.time_limit_steps, info["n_inside"] / spec.hold_steps],
+            [np.arcsinh(info["errors"][name] / bound) for name, bound in self._bounds.items()],
+        ]
+        return {
+            READ: self._read[0].numpy().copy(),
+            PRIVILEGED: np.concatenate(privileged).astype(np.float32),
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class MakeStage:
+    """Makes one of a run's players; travels to its process.
+
+    Attributes:
+        task: Named task.
+        options: Task options that differ from it.
+        split: Stream of scenes.
+        folder: Checkpoint that plays.
+        settings: Of the run.
+        seed: Of the run.
+        part: Which of the players it is; they share the scenes between them.
+        place: Where to begin.
+    """
+
+    task: str
+    options: Mapping[str, Any]
+    split: str
+    folder: str
+    settings: Settings
+    seed: int
+    part: int = 0
+    place: Place = Place()
+
+    @property
+    def bounds(self) -> dict[str, float]:
+        """Bounds of the task's metrics, by name."""
+        spec = find(self.task).with_options(self.options)
+        return {metric.name: metric.bound for metric in spec.metrics if metric.bound is not None}
+
+    @property
+    def n_privileged(self) -> int:
+        """Numbers that only critics see."""
+        return 3 * N_LENGTHS + 2 + len(self.bounds)
+
+    def __call__(self) -> Stage:
+        """Make it."""
+        return Stage(self)
