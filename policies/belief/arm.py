@@ -189,8 +189,8 @@ def kept_above(
     What comes down fast, one joint against another, is easily some centimetres too low, and touches
     what the goal is above. So near the goal the tip stays on its side: its height along the normal
     is at least `DOUBTS` times how well the goal's is known, less `BEYOND_M`; farther than
-    `BESIDE_M` beside it, as much less as it is farther. And nowhere is it lower than it ever was in
-    the demonstrations. Gauss-Newton on these heights, damped as `joint_step` is; angles that are
+    `BESIDE_M` beside it, as much less as it is farther. And nowhere is it much lower than the
+    lowest of all goals. Gauss-Newton on these heights, damped as `joint_step` is; angles that are
     high enough are left alone.
 
     Args:

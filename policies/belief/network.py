@@ -40,9 +40,6 @@ from hvs_suite.policies.network.geometry import FlangeMotion
 N_JOINTS = 7
 HEIGHTS_M = (0.0, 0.05, 0.15)
 """Above the goal, along its normal: the plain postures that the head is shown."""
-LOWER_M = 0.002
-"""The tip may go so much lower than it ever was in the demonstrations (m): joints are measured with
-errors."""
 RECENT_SIZE = 4
 """What is remembered beside belief and set point: for how long each camera has not seen the target
 (two), and a trace of what was forgotten (two)."""
@@ -220,7 +217,7 @@ class BeliefNetwork(nn.Module):
 
         Args:
             prior: Of the belief.
-            lowest_m: Where the tip was lowest over the base (m).
+            lowest_m: Height of the lowest goal over the base (m).
         """
         self.belief.set_prior(prior)
         self.lowest_m.fill_(lowest_m)
@@ -461,7 +458,7 @@ class BeliefNetwork(nn.Module):
         P = memory[:, COVARIANCE].view(-1, N_MOTION, N_MOTION)[:, PLACE, PLACE].float()
         doubt = (normal * (P @ normal[:, :, None])[:, :, 0]).sum(dim=1, keepdim=True)
         doubt = doubt.clamp(min=0.0).sqrt()
-        lowest = self.lowest_m - LOWER_M
+        lowest = self.lowest_m - arm.BEYOND_M
         target = arm.kept_above(target, goal, normal, doubt, lowest, self.cell.tool_length_m)
         return (target / self.joint_range).clamp(-1.0, 1.0)
 

@@ -7,7 +7,6 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from hvs_suite.policies.belief.arm import tip_of
 from hvs_suite.policies.belief.belief import ACCELERATION, N_MOTION, PLACE, VELOCITY, Prior, View
 from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
 from hvs_suite.policies.network.dataset import (
@@ -92,14 +91,12 @@ def take_prior(network: BeliefNetwork, columns: Mapping[str, npt.NDArray[np.gene
     """Give a network what demonstrations say beforehand.
 
     Args:
-        network: Gets it: the prior of its belief, and how low the tip goes.
+        network: Gets it: the prior of its belief, and how low goals lie.
         columns: As in `fit_prior`, and ``observation.state`` (n, 14).
     """
-    q = _double(columns[STATE])[:, :N_JOINTS]
-    motion = flange_motion(q)
-    prior = fit_prior(columns, network.views(motion), network.cell.period_s)
-    tip = tip_of(motion, network.cell.tool_length_m).position
-    network.set_prior(prior, float(tip[:, 2].min()))
+    views = network.views(flange_motion(_double(columns[STATE])[:, :N_JOINTS]))
+    prior = fit_prior(columns, views, network.cell.period_s)
+    network.set_prior(prior, float(np.asarray(columns[GOAL_POSITION])[:, 2].min()))
 
 
 def _standoff(goal: Tensor, normal: Tensor, target: Tensor, view: View) -> float:

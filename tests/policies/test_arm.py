@@ -59,7 +59,7 @@ def test_the_tip_stays_above_where_the_goal_may_be(doubt_m: float) -> None:
     np.testing.assert_allclose(height, least, atol=4e-3)
 
 
-def test_the_tip_goes_nowhere_lower_than_the_demonstrations_did() -> None:
+def test_the_tip_is_nowhere_below_the_lowest_of_all_goals() -> None:
     place, _ = goals(50, tilt=0.0)
     q = torch.nn.functional.pad(arm.postures(place, UP.expand(50, 3))[:, 0], (0, 1))
     elsewhere = place + torch.tensor([0.5, 0.5, -0.3])
