@@ -208,16 +208,13 @@ class Planner:
             family = self._with_short_way_on(family, onward)
         if len(family) == 0:
             return q
-        required = min(CLEARANCE_M, self._clearance_m - 1e-3)
         most = _MAX_PATHS_AMONG_OBSTACLES if self._solids else _MAX_PATHS
-        motion = None
-        if self._wanted_m > CLEARANCE_M:
-            wanted = min(self._wanted_m, self._clearance_m - 1e-3)
-            candidates = self._in_order(q, velocity, family)
-            motion = self._first_clear(q, velocity, candidates, wanted, most)
-        if motion is None:
+        clearances = {min(m, self._clearance_m - 1e-3) for m in (self._wanted_m, CLEARANCE_M)}
+        for required in sorted(clearances, reverse=True):
             candidates = self._in_order(q, velocity, family)
             motion = self._first_clear(q, velocity, candidates, required, most)
+            if motion is not None:
+                break
         if motion is None and self._solids:
             vias = self._vias(q, velocity, goal)
             motion = self._first_clear(q, velocity, vias, required, _MAX_VIAS)

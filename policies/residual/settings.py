@@ -23,7 +23,7 @@ class Settings:
         batch_size: Transitions an update.
         tau: Share of the critics that goes into their targets after an update.
         actor_tau: Share of the actor that goes into its average, which is what plays in the end.
-        gamma: Discount; below 1 it also pays for haste.
+        gamma: Discount; below 1 an early success is worth more.
         replay_size: Transitions kept.
         warm_up_steps: Decisions in which the critics learn alone.
         updates: Updates a decision, made while the next is played.

@@ -1,0 +1,76 @@
+"""Ways into a hole: the expert's, and the one that demonstrations show."""
+
+import numpy as np
+import pytest
+
+import hvs_suite
+from hvs_suite.cell.kinematics import kinematics
+from hvs_suite.cell.robot import JOINT_ACCELERATION_RAD_S2
+from hvs_suite.datasets.expert import Expert
+from hvs_suite.datasets.insertion import GuardedInsertion
+from hvs_suite.datasets.looking import Demonstrator
+from hvs_suite.registry import TASKS
+from hvs_suite.tasks.shared.goal import UP, Goal
+
+HEIGHT_M = 0.04
+
+
+def next_heights(caught_mm: float | None) -> list[float]:
+    """Heights (mm) that the tip is sent to from 40 mm, 0.4 and 0.6 mm beside the axis."""
+    spec = TASKS["insert-wide"]
+    model = kinematics(spec.embodiment)
+    insertion = GuardedInsertion(spec.control_period_s, spec.embodiment)
+    goal = Goal(np.array([0.6, 0.1, 0.05]), UP, -0.013)
+    above = model.goal_configurations_at_tool_angle(goal.target + HEIGHT_M * UP, UP, 0.0)
+    posture = above[np.abs(above).max(axis=1).argmin()]
+    heights = []
+    for beside_m in (0.0004, 0.0006):
+        place = goal.target + np.array([beside_m, 0.0, HEIGHT_M])
+        q = model.nearest_configuration(posture, place, UP, JOINT_ACCELERATION_RAD_S2)
+        assert q is not None
+        still = np.zeros(7)
+        sent = (
+            insertion.next_set_point(q, still, q, goal)
+            if caught_mm is None
+            else insertion.learnable_set_point(q, still, q, goal, caught_mm)
+        )
+        heights.append(1000.0 * (model.tip_pose(sent)[1] - goal.target)[2])
+    return heights
+
+
+def test_a_way_that_can_be_learned_does_not_turn_back_at_half_a_millimetre() -> None:
+    left, right = next_heights(1.5)
+    assert abs(left - right) < 1.0
+    assert max(left, right) < 1000.0 * HEIGHT_M - 5.0
+    left, right = next_heights(None)
+    assert right - left > 5.0
+
+
+@pytest.mark.parametrize("task", ["insert-wide", "insert-jig", "insert-feel"])
+def test_demonstrations_go_into_the_hole(task: str) -> None:
+    with hvs_suite.load(task, split="dev") as env:
+        env.draws = False
+        for scenario in range(2):
+            demonstrator = Demonstrator(env)
+            time_step = env.reset(scenario=scenario)
+            while not time_step.last():
+                time_step = env.step(demonstrator.label())
+            assert env.info["is_success"]
+
+
+def test_demonstrations_pass_higher_over_the_table_than_the_expert() -> None:
+    lowest = {}
+    with hvs_suite.load("sequence-thesis", split="dev") as env:
+        env.draws = False
+        for kind in (Expert, Demonstrator):
+            heights = []
+            for scenario in range(4):
+                guide = kind(env)
+                time_step = env.reset(scenario=scenario)
+                while not time_step.last():
+                    time_step = env.step(guide.label())
+                    heights.append(env.tip().position[2])
+                assert env.info["is_success"]
+            lowest[kind] = min(heights)
+    assert lowest[Expert] < 0.025
+    assert lowest[Demonstrator] > 0.025
