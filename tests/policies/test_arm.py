@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from hvs_suite.cell import robot
 from hvs_suite.policies.belief import arm
 from hvs_suite.policies.network.geometry import flange_motion
 
@@ -77,3 +78,19 @@ def test_a_tip_that_is_high_enough_or_far_beside_is_left_alone() -> None:
     side = torch.linalg.cross(normal, UP.expand(50, 3) + 0.1, dim=1)
     far = place + 0.3 * side / side.norm(dim=1, keepdim=True) + 0.1 * normal
     assert (arm.kept_above(q, far, normal, doubt, NOWHERE, 0.0) == q).all()
+
+
+def test_a_step_along_a_way_leaves_room_to_brake() -> None:
+    period_s = 0.1
+    turns = 3.0 * torch.randn(200, 6, generator=torch.Generator().manual_seed(2)) ** 3
+    step = turns * arm.share_of_way(turns, period_s)
+    fastest, braking = (
+        torch.tensor(limits[:6])
+        for limits in (robot.JOINT_SPEED_RAD_S, robot.JOINT_ACCELERATION_RAD_S2)
+    )
+    speed = step.abs() / period_s
+    assert (speed <= fastest * (1.0 + 1e-5)).all()
+    needed = speed**2 / (2.0 * braking) + 0.5 * period_s * speed
+    assert ((needed <= turns.abs() * (1.0 + 1e-4)) | (step.abs() <= fastest * 1e-3)).all()
+    near = torch.full((1, 6), 1e-4)
+    torch.testing.assert_close(arm.share_of_way(near, period_s), torch.ones(1, 1))
