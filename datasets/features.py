@@ -34,6 +34,8 @@ ROBOT_TYPE = "kuka_lbr_iiwa"
 JOINT_NAMES = ("A1", "A2", "A3", "A4", "A5", "A6", "A7")
 CAMERAS = ("eih", "eth")
 
+OBSERVATION = "observation."
+IMAGES = "observation.images."
 STATE = "observation.state"
 ACTION = "action"
 PRIVILEGED = "privileged."
@@ -48,12 +50,12 @@ Frame = dict[str, npt.NDArray[Any]]
 
 def image_key(camera: str) -> str:
     """Feature of a camera's images."""
-    return f"observation.images.{camera}"
+    return f"{IMAGES}{camera}"
 
 
 def vector_key(name: str) -> str:
     """Feature of a vector that a family shows beside cameras and joints."""
-    return f"observation.{name}"
+    return f"{OBSERVATION}{name}"
 
 
 def dataset_features(spec: Spec) -> dict[str, dict[str, Any]]:

@@ -24,7 +24,7 @@ FAMILY = "align"
 CONTROL_PERIOD_S = 0.1
 """What checkpoints are for that do not say it."""
 
-OURS = ("hvs", "hvs_belief", "hvs_sac")
+OURS = ("hvs", "hvs_sac")
 """Types of policies that say what they are for, or are from before it was kept."""
 
 _MOST_WORDS = 200

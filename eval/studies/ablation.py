@@ -18,7 +18,8 @@ from hvs_suite.eval.scoring.comparison import Tally
 from hvs_suite.eval.scoring.result_file import Result
 from hvs_suite.eval.studies.training import SPLIT, Note, Report, train_and_judge
 from hvs_suite.executor import Workers
-from hvs_suite.policies.network.dataset import read_manifest
+from hvs_suite.policies.imitation.settings import Settings
+from hvs_suite.policies.training.dataset import read_manifest
 from hvs_suite.registry import find
 
 WHOLE = "everything"
@@ -43,15 +44,15 @@ class Ablation:
 
 
 _ALONE: Mapping[str, Any] = MappingProxyType({"dagger_rounds": 0})
+_FRAMES = Settings.windows * Settings.window_steps
 ABLATIONS: Mapping[str, Ablation] = MappingProxyType(
     {
         WHOLE: Ablation(),
-        "no keypoint supervision": Ablation({"keypoint_weight": 0.0}),
+        "frames, not sequences": Ablation({"window_steps": 1, "windows": _FRAMES}),
         "linear joint steps": Ablation({"error_scale": LINEAR_SCALE}),
         NO_DAGGER: Ablation(_ALONE),
-        "no eye in hand": Ablation({"inputs": ("eth", "joints")}),
-        "no eye to hand": Ablation({"inputs": ("eih", "joints")}),
-        "no joints": Ablation({"inputs": ("eih", "eth")}),
+        "no eye in hand": Ablation({"inputs": ("eth",)}),
+        "no eye to hand": Ablation({"inputs": ("eih",)}),
         "no DAgger, 1/4 of the data": Ablation(_ALONE, 1 / 4, NO_DAGGER),
         "no DAgger, 1/16 of the data": Ablation(_ALONE, 1 / 16, NO_DAGGER),
     }

@@ -7,11 +7,10 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from hvs_suite.errors import PolicyError
 from hvs_suite.pictures import GREEN, Picture, as_rgb, resize, strip
+from hvs_suite.policies.belief.eye import UV, VISIBLE
 from hvs_suite.policies.checkpoints.files import read_config
-from hvs_suite.policies.checkpoints.loading import load_network
-from hvs_suite.policies.network.network import HvsNetwork, Sighting
+from hvs_suite.policies.checkpoints.loading import Inputs, load_network, network_inputs
 from hvs_suite.rollout import (
     Action,
     Instructed,
@@ -53,17 +52,16 @@ def draw_attention(folder: Path, env: "Environment", policy: Policy, scenario: i
     Raises:
         PolicyError: The checkpoint is not of an `hvs` policy, or cannot be loaded.
     """
-    config = read_config(folder)
-    if config.get("type") != "hvs":
-        raise PolicyError(f"{folder} holds a policy of type {config.get('type')}, not hvs")
-    network = load_network(folder, config)
+    network, config = load_network(folder), read_config(folder)
     seen = _Seen(env, policy)
     run_episode(env, seen, scenario)
     steps = np.unique(np.linspace(0, len(seen.observations) - 1, COLUMNS).round().astype(int))
+    shown = [seen.observations[step] for step in steps]
+    inputs = [network_inputs(network, config, observation) for observation in shown]
     rows = {
         TITLES[camera]: [
-            _tile(network, camera, seen.observations[step][camera], seen.truths[step][camera])
-            for step in steps
+            _tile(network.eyes[camera], camera, *each, seen.truths[step][camera])
+            for step, *each in zip(steps, [one[camera] for one in shown], inputs, strict=True)
         ]
         for camera in network.shape.cameras
     }
@@ -94,16 +92,15 @@ class _Seen:
 
 
 def _tile(
-    network: HvsNetwork, camera: str, image: npt.NDArray[Any], truth: npt.NDArray[Any]
+    eye: Any, camera: str, image: npt.NDArray[Any], inputs: Inputs, truth: npt.NDArray[Any]
 ) -> Picture:
     """One picture under its attention, with estimate and truth marked."""
     from PIL import Image, ImageDraw
 
-    eye: Any = network.eyes[camera]
-    tensor = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255.0
+    tensor = inputs.images[camera]
     with torch.no_grad(), one_torch_thread():
-        heat = eye.attention(tensor)[0].numpy()
-        sighting: Sighting = eye(tensor)
+        heat = eye.attention(tensor, inputs.goal)[0].numpy()
+        sighting = eye(tensor, inputs.goal)[0]
     picture = resize(as_rgb(image), _TILE_PX).astype(np.float64)
     spread = Image.fromarray((heat / heat.max()).astype(np.float32), mode="F")
     share = np.asarray(spread.resize((_TILE_PX, _TILE_PX), Image.Resampling.BILINEAR))[..., None]
@@ -113,8 +110,8 @@ def _tile(
     if truth[3] > 0.5:
         x, y = _pixel(truth[:2])
         draw.ellipse((x - 9, y - 9, x + 9, y + 9), outline=GREEN, width=2)
-    if float(sighting.visible_logit) > 0.0:
-        x, y = _pixel(sighting.uv[0].numpy())
+    if float(sighting[VISIBLE]) > 0.0:
+        x, y = _pixel(sighting[UV].numpy())
         draw.line((x - 7, y, x + 7, y), _ESTIMATE, 2)
         draw.line((x, y - 7, x, y + 7), _ESTIMATE, 2)
     return np.asarray(tile)

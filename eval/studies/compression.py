@@ -39,7 +39,7 @@ from hvs_suite.eval.studies.training import Note, Report, train_and_judge
 from hvs_suite.executor import Workers, check_workers
 from hvs_suite.files import check_writable, replacing
 from hvs_suite.policies.imitation.frame_cache import fingerprint
-from hvs_suite.policies.network.dataset import read_manifest, refuse_test_split
+from hvs_suite.policies.training.dataset import read_manifest, refuse_test_split
 from hvs_suite.registry import find
 
 LOSSLESS = "PNG"

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from hvs_suite import registry
@@ -24,6 +25,9 @@ from hvs_suite.eval.scoring import result_file, verification
 from hvs_suite.eval.scoring.result_file import EpisodeRow
 from hvs_suite.eval.scoring.trial import play_trial
 from hvs_suite.names import shown
+from hvs_suite.policies.belief.belief import PLACE
+from hvs_suite.policies.belief.geometry import flange_motion
+from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
 from hvs_suite.policies.checkpoints.files import read_config
 from hvs_suite.policies.checkpoints.loading import load_network, network_inputs
 from hvs_suite.rollout import Action, Observation, one_torch_thread
@@ -31,8 +35,9 @@ from hvs_suite.tasks.shared.option_types import listed
 from hvs_suite.tasks.shared.spec import Spec
 
 if TYPE_CHECKING:
-    from hvs_suite.policies.network.network import HvsNetwork
     from hvs_suite.tasks.shared.environment import Environment
+
+FloatArray = npt.NDArray[np.float64]
 
 # An error that falls by a fifth in so many steps is on its way to the goal.
 _LAST_STEPS = 3
@@ -141,9 +146,9 @@ def sort_failures(
     """
     result = result_file.load(path)
     log = verification.load_actions(path, result)
-    network = None
-    if checkpoint is not None:
-        network = load_network(checkpoint, read_config(checkpoint))
+    asked = (
+        None if checkpoint is None else _Asked(load_network(checkpoint), read_config(checkpoint))
+    )
     failures = []
     summary, options = result.summary, result.metadata.options
     with contextlib.closing(registry.load(summary.task, split=summary.split, **options)) as env:
@@ -158,7 +163,7 @@ def sort_failures(
             else:
                 assert unlogged is not None
                 _, actions = play_trial(env, unlogged.reset, unlogged.select_action, row.scenario)
-            failures.append(_sort(env, row, list(actions[: row.steps]), network))
+            failures.append(_sort(env, row, list(actions[: row.steps]), asked))
             if progress is not None:
                 progress()
     return Report(
@@ -166,13 +171,42 @@ def sort_failures(
     )
 
 
+class _Asked:
+    """A network that is asked, at every step of an episode, where it takes the target to be."""
+
+    def __init__(self, network: BeliefNetwork, config: Mapping[str, Any]) -> None:
+        self._network, self._config = network, config
+        self.reset()
+
+    def reset(self) -> None:
+        """A new episode begins."""
+        self._memory = self._network.start(1)
+
+    def way_to_target(self, observation: Observation) -> FloatArray:
+        """The way from the flange, by the measured joints, to the believed target, (3,) m."""
+        network = self._network
+        inputs = network_inputs(network, self._config, observation)
+        q = inputs.state[:, :N_JOINTS]
+        with torch.inference_mode(), one_torch_thread():
+            sightings = network.look(inputs.images, inputs.goal)
+            self._memory = network.remember(self._memory, sightings, q)
+            way = self._memory[:, PLACE] - flange_motion(q.double()).position
+        return np.array(way[0].numpy())
+
+    def remember(self, action: Action) -> None:
+        """Where the arm was sent."""
+        with torch.inference_mode(), one_torch_thread():
+            self._memory = self._network.commanded(self._memory, torch.from_numpy(action)[None])
+
+
 def _sort(
-    env: "Environment", row: EpisodeRow, actions: Sequence[Action], network: "HvsNetwork | None"
+    env: "Environment", row: EpisodeRow, actions: Sequence[Action], asked: "_Asked | None"
 ) -> Failure:
     """Play one lost scenario and say why it was lost."""
     time_step = env.reset(scenario=row.scenario)
     target = np.asarray(env.privileged()["target_position"])
-    memory: Any = None
+    if asked is not None:
+        asked.reset()
     off_mm: float | None = None
     seen = 0
     distances_m = [env.distance_m]
@@ -183,15 +217,12 @@ def _sort(
         truth = env.privileged()
         seen += any(truth[f"target_{camera}"][3] > 0.5 for camera in ("eih", "eth"))
         executed = np.clip(action, spec.minimum, spec.maximum).astype(np.float32)
-        if network is not None:
-            with torch.inference_mode(), one_torch_thread():
-                decision = network(*network_inputs(network, time_step.observation), memory)
-            if decision.memory is not None:
-                memory = network.commanded(decision.memory, torch.from_numpy(executed)[None])
-            if decision.target is not None and decision.motion is not None:
-                _, flange = kinematics().flange_pose(env.joint_positions)
-                believed = (decision.target - decision.motion.position)[0].double().numpy()
-                off_mm = 1e3 * float(np.linalg.norm((believed - (target - flange))[:2]))
+        if asked is not None:
+            _, flange = kinematics().flange_pose(env.joint_positions)
+            way = np.asarray(truth["target_position"]) - flange
+            off = asked.way_to_target(time_step.observation) - way
+            off_mm = 1e3 * float(np.linalg.norm(off[:2]))
+            asked.remember(executed)
         time_step = env.step(executed)
         distances_m.append(env.distance_m)
     return Failure(

@@ -9,7 +9,7 @@ no base. All lie in one folder; what is finished there is not done again.
 import contextlib
 import dataclasses
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,22 +21,15 @@ from hvs_suite.eval.scoring.result_file import Result
 from hvs_suite.eval.studies.training import Note, Report, train_and_judge
 from hvs_suite.executor import Workers, check_workers, spread
 from hvs_suite.files import replacing
-from hvs_suite.policies.network.dataset import read_manifest
+from hvs_suite.policies.training.dataset import read_manifest
 from hvs_suite.rollout import one_torch_thread
 
 BASE = "base"
 FINETUNED, IMITATED, SCRATCH = "RL fine-tuning", "more imitation", "RL from scratch"
 EVAL_EPISODES = 100
 """Largest number of scenes of an evaluation during RL."""
-WEAK_BASE: Mapping[str, Any] = {
-    "updates": 40,
-    "warm_up_steps": 1_000,
-    "bound": 1.2,
-    "noise": 0.1,
-    "penalty": 0.01,
-}
-"""What fine-tuning does otherwise than by default: a base that is far too slow must be changed by
-more than one that is good already (docs/experiments/few-demonstrations.md)."""
+EVERYWHERE_M = 10.0
+"""How far from the goal fine-tuning moves it: a weak base may never come near."""
 STUDY_FILE = "study.json"
 
 
@@ -126,8 +119,6 @@ class Budget:
         base_steps: Optimiser steps of each base.
         imitation_steps: Optimiser steps of the run that imitates more, its base's included.
         imitation_rounds: Rounds that its environment steps are spread over.
-        eye_frames: Environment steps of fine-tuning that train the eyes, in two rounds.
-        eye_steps: Optimiser steps of each of them.
         episodes: Scenes of split ``dev`` that ends are judged on.
     """
 
@@ -135,8 +126,6 @@ class Budget:
     base_steps: int
     imitation_steps: int
     imitation_rounds: int
-    eye_frames: int
-    eye_steps: int
     episodes: int
 
     def __post_init__(self) -> None:
@@ -146,13 +135,12 @@ class Budget:
             OptionError: A number is too small.
         """
         for field in dataclasses.fields(self):
-            least = 0 if field.name == "eye_frames" else 1
-            if getattr(self, field.name) < least:
+            if getattr(self, field.name) < 1:
                 raise OptionError(
-                    f"{field.name} must be at least {least}, not {getattr(self, field.name)}"
+                    f"{field.name} must be at least 1, not {getattr(self, field.name)}"
                 )
-        if self.eye_frames >= self.env_steps or self.imitation_rounds > self.env_steps:
-            raise OptionError("env_steps must be more than eye_frames and imitation_rounds")
+        if self.imitation_rounds > self.env_steps:
+            raise OptionError("env_steps must be at least imitation_rounds")
 
 
 class Study(pydantic.BaseModel):
@@ -358,18 +346,10 @@ class _Maker:
 
     def finetuned(self, count: int, seed: int) -> tuple[list[Point], Result, float]:
         """Fine-tune the base by RL."""
-        from hvs_suite.policies.finetune.settings import Settings
-        from hvs_suite.policies.finetune.training import finetune
+        from hvs_suite.policies.residual.settings import Settings
+        from hvs_suite.policies.residual.td3 import finetune
 
-        budget = self.budget
-        steps = budget.env_steps - budget.eye_frames
-        settings = Settings(
-            eye_rounds=2 if budget.eye_frames >= 2 else 0,
-            eye_frames=max(1, budget.eye_frames // 2),
-            eye_steps=budget.eye_steps,
-            environments=1,
-            **WEAK_BASE,
-        )
+        steps = self.budget.env_steps
 
         def train(policy: Path, note: Note) -> None:
             finetune(
@@ -378,14 +358,14 @@ class _Maker:
                 policy,
                 steps=steps,
                 seed=seed,
-                settings=settings,
+                settings=Settings(environments=1, reach_m=EVERYWHERE_M),
                 eval_every=max(1, steps // 5),
-                eval_episodes=min(EVAL_EPISODES, budget.episodes),
+                eval_episodes=min(EVAL_EPISODES, self.budget.episodes),
                 on_progress=note,
             )
 
         training, end = self._made("finetuned", count, seed, train)
-        return _evaluated(training, budget.eye_frames), end, _minutes(training)
+        return _evaluated(training), end, _minutes(training)
 
     def imitated(self, count: int, seed: int) -> tuple[list[Point], Result, float]:
         """Let the expert label every step instead."""
@@ -432,7 +412,7 @@ class _Maker:
             )
 
         training, end = self._made("scratch", 0, seed, train)
-        return _evaluated(training, 0), end, _minutes(training)
+        return _evaluated(training), end, _minutes(training)
 
     def _folder(self, way: str, count: int, seed: int) -> Path:
         return self.out / f"seed-{seed}" / (f"{way}-{count}" if count else way)
@@ -451,18 +431,17 @@ class _Maker:
 
 
 def _minutes(training: Path) -> float:
-    """What a training and, before it, the eyes' rounds took."""
-    outcomes = [training / "outcome.json", *training.glob("eyes/*/outcome.json")]
-    read = [json.loads(path.read_text(encoding="utf-8")) for path in outcomes]
-    return float(sum(each["train_s"] + each.get("play_s", 0.0) for each in read)) / 60.0
+    """What a training took."""
+    outcome = json.loads((training / "outcome.json").read_text(encoding="utf-8"))
+    return float(outcome["train_s"] + outcome.get("play_s", 0.0)) / 60.0
 
 
-def _evaluated(training: Path, played_before: int) -> list[Point]:
+def _evaluated(training: Path) -> list[Point]:
     """Success of an RL run during its training, without its end."""
     rows = json.loads((training / "evaluations.json").read_text())[:-1]
     return [
         Point(
-            env_steps=played_before + row["env_steps"],
+            env_steps=row["env_steps"],
             n=row["episodes"],
             n_success=round(row["success_rate"] * row["episodes"]),
         )

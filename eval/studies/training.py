@@ -19,8 +19,8 @@ Note = Callable[[Any], None]
 """Takes the progress of a training."""
 
 SPLIT = "dev"
-GIGABYTES = ("cache", "dagger", "replay", "eyes/*/frames")
-"""Folders of a training that are not needed again, as patterns."""
+NOT_NEEDED_AGAIN = ("cache", "dagger", "replay", "seen.safetensors")
+"""What takes most of the room in the folder of a training that is finished."""
 
 
 def train_and_judge(
@@ -72,7 +72,10 @@ def train_and_judge(
         workers=workers,
         progress=note_playing,
     )
-    for pattern in GIGABYTES:
-        for folder in (run / "policy" / "training").glob(pattern):
-            shutil.rmtree(folder, ignore_errors=True)
+    for name in NOT_NEEDED_AGAIN:
+        path = run / "policy" / "training" / name
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
     return result

@@ -24,6 +24,7 @@ class Demo:
         episodes: Demonstrations to record.
         minutes: Training time (min).
         dagger_rounds: How often the policy plays in between and the expert corrects it.
+        dagger_frames: Frames of each of these rounds.
         evaluations: Test scenarios to score the policy on.
         overwrite: Replace what an earlier demo left in the folder.
     """
@@ -32,7 +33,8 @@ class Demo:
     task: str = "align-easy"
     episodes: int = 1000
     minutes: float = 4.0
-    dagger_rounds: int = 0
+    dagger_rounds: int = 1
+    dagger_frames: int = 2000
     evaluations: int = 50
     overwrite: bool = False
 
@@ -64,7 +66,11 @@ class Demo:
             ).run()
         with console.stage(f"train a policy on them for {self.minutes:g} min", times_s):
             Pretrain(
-                data=dataset, out=policy, minutes=self.minutes, dagger_rounds=self.dagger_rounds
+                data=dataset,
+                out=policy,
+                minutes=self.minutes,
+                dagger_rounds=self.dagger_rounds,
+                dagger_frames=self.dagger_frames,
             ).run()
         with console.stage(f"score it on {self.evaluations} test scenarios", times_s):
             Evaluate(

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from hvs_suite.cli import console
 from hvs_suite.cli.players import Players
@@ -31,19 +31,14 @@ class Pretrain(Players):
         dagger_rounds: DAgger rounds, spread over the training: the policy plays, the expert labels
             every step, and the frames are added. Their time comes on top of --minutes.
         dagger_frames: Frames a round.
-        inputs: What the policy is given: names joined by +, such as eih+joints; all of eih, eth
-            and joints by default.
+        inputs: Cameras that the policy is given, eih or eth; both by default (eih+eth).
         episodes: Number of demonstrations to learn from, the first ones of the dataset; all by
             default.
-        rehearsal_frames: Frames a step that the head alone learns from, without their images.
-        keypoint_weight: Weight of the loss on where the target is; 0 trains on the actions alone.
         error_scale: Errors of a joint's step (rad) and of a place (m) weigh linearly below this
             and logarithmically above; five times the task's tightest tolerance by default.
         eyes: Policy whose eyes to start from, where the target is too small for untrained eyes to
             find: a checkpoint folder, or a named task for the weights shipped for it.
-        policy: Which policy to train: hvs, which knows targets on a level surface, or hvs_belief,
-            which learns from any family's demonstrations.
-        windows: Windows of control steps a step that belief and head of hvs_belief learn from.
+        windows: Windows of control steps that belief and head learn from in a step.
         window_steps: Length of each.
         seed: Seed of the initial weights, the held-out episodes and the order.
     """
@@ -56,11 +51,8 @@ class Pretrain(Players):
     dagger_frames: int = 6000
     inputs: str | None = None
     episodes: int | None = None
-    rehearsal_frames: int = 512
-    keypoint_weight: float = 1.0
     error_scale: float | None = None
     eyes: str | None = None
-    policy: Literal["hvs", "hvs_belief"] = "hvs"
     windows: int = 48
     window_steps: int = 16
     seed: int = 0
@@ -82,11 +74,8 @@ class Pretrain(Players):
                 dagger_frames=self.dagger_frames,
                 inputs=None if self.inputs is None else tuple(self.inputs.split("+")),
                 episodes=self.episodes,
-                rehearsal_frames=self.rehearsal_frames,
-                keypoint_weight=self.keypoint_weight,
                 error_scale=self.error_scale,
                 eyes=None if self.eyes is None else _folder(self.eyes),
-                policy=self.policy,
                 windows=self.windows,
                 window_steps=self.window_steps,
                 workers=self.players(local=2),

@@ -90,8 +90,8 @@ class Ablation(Players):
     Attributes:
         data: Recorded dataset; its task is played.
         out: Folder of the study: study.json, study.md, study.png, and a sub-folder a policy.
-        row: What to leave out, such as "no joints"; give it several times; everything that can be
-            left out by default.
+        row: What to leave out, such as "no eye in hand"; give it several times; everything that
+            can be left out by default.
         steps: Optimiser steps of each policy.
         dagger_rounds: DAgger rounds, where they are not what is left out.
         dagger_frames: Frames a round.
@@ -149,8 +149,6 @@ class FewDemonstrations:
         base_steps: Optimiser steps of each base.
         imitation_steps: Optimiser steps of DAgger, its base's included.
         imitation_rounds: Rounds that its environment steps are spread over.
-        eye_frames: Environment steps of fine-tuning that train the eyes, in two rounds.
-        eye_steps: Optimiser steps of each of them.
         seeds: Runs of everything.
         episodes: Scenes of split dev that bases and ends are judged on.
         processes: Processes that make runs side by side, each on one core; without it 2, or with
@@ -166,8 +164,6 @@ class FewDemonstrations:
     base_steps: int = 1_000
     imitation_steps: int = 2_500
     imitation_rounds: int = 4
-    eye_frames: int = 4_000
-    eye_steps: int = 500
     seeds: int = 3
     episodes: int = 200
     processes: int | None = None
@@ -184,8 +180,6 @@ class FewDemonstrations:
             base_steps=self.base_steps,
             imitation_steps=self.imitation_steps,
             imitation_rounds=self.imitation_rounds,
-            eye_frames=self.eye_frames,
-            eye_steps=self.eye_steps,
             episodes=self.episodes,
         )
         counts = self.demonstrations or (25, 50, 100, 200)

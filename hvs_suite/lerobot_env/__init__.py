@@ -9,8 +9,7 @@ type, and those of the suite's own policies with it: LeRobot does not accept
 seconds.
 """
 
-import hvs_suite.policies.hvs
-import hvs_suite.policies.hvs_belief  # noqa: F401 - they register the policies' types
+import hvs_suite.policies.hvs  # noqa: F401 - registers the policy's type
 from hvs_suite.lerobot_env.configuration import HvsEnvConfig
 
 __all__ = ["HvsEnvConfig"]

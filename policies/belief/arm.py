@@ -16,7 +16,7 @@ from hvs_suite.cell.robot import (
     SHOULDER_TO_ELBOW_M,
     WRIST_TO_FLANGE_M,
 )
-from hvs_suite.policies.network.geometry import FlangeMotion, flange_motion
+from hvs_suite.policies.belief.geometry import FlangeMotion, flange_motion
 
 DAMPING_M = 0.03
 """Of the least-squares inverse: small against the arm's 0.4 m links, large enough to keep steps

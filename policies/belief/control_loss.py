@@ -4,9 +4,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
-from hvs_suite.policies.belief import arm
+from hvs_suite.policies.belief import arm, geometry
 from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
-from hvs_suite.policies.network import geometry
 
 HUBER_BETA = 0.3
 TIP_WEIGHT = 0.3

@@ -11,8 +11,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from hvs_suite.policies.network.network import strides
-
+FEATURE_SIZE = 28
+"""Cells along the side of a feature map, about."""
 PATCH_SIZE = 8
 PATCH_CHANNELS = 16
 PATCH_DIAMETERS = 2.5
@@ -30,6 +30,24 @@ UV, LOG_DIAMETER, VISIBLE, LOG_SIGMA_UV, LOG_SIGMA_SIZE, SLOPE, LOG_SIGMA_SLOPE 
 """What a sighting (B, 9) holds: the target's centre in [-1, 1] (u right, v down), the logarithm of
 its apparent diameter in image widths, the logit that it is in view, x and y of its normal in the
 camera's optical frame, and the logarithms of the standard deviations of these."""
+
+
+def strides(side: int) -> tuple[int, ...]:
+    """Strides of 4, 3 or 2 px that bring an image to about `FEATURE_SIZE` cells.
+
+    Args:
+        side: Side of the square image (px).
+
+    Returns:
+        Strides of the down-sampling convolutions; empty for tiny images.
+    """
+    factor = max(1, round(side / FEATURE_SIZE))
+    plan: list[int] = []
+    while factor > 1:
+        step = 3 if factor % 3 == 0 else 2
+        plan.append(step)
+        factor = round(factor / step)
+    return tuple(sorted(plan, reverse=True))
 
 
 class Eye(nn.Module):
@@ -105,6 +123,19 @@ class Eye(nn.Module):
         )
         # A mark that is cut by the image's border has its centre elsewhere than what is in view.
         return torch.cat([uv + judged[:, UV], size + judged[:, LOG_DIAMETER], judged[:, 3:]], dim=1)
+
+    def attention(self, images: Tensor, goal: Tensor | None = None) -> Tensor:
+        """The distribution over cells whose mean is where the target is looked for first.
+
+        Args:
+            images: As in `forward`.
+            goal: As in `forward`.
+
+        Returns:
+            (B, h, w), each of which sums to 1.
+        """
+        scores = self.score(self._maps(images, goal))[..., 0]
+        return torch.softmax(scores.flatten(1), dim=1).view_as(scores)
 
     def _around(self, maps: Tensor, uv: Tensor, log_diameter: Tensor) -> Tensor:
         """Features around a place, its surroundings scaled by the target's size."""

@@ -10,12 +10,12 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from hvs_suite.policies.belief import geometry
 from hvs_suite.policies.belief.belief import BELIEF_SIZE, View, belief_loss
 from hvs_suite.policies.belief.control_loss import TIP_WEIGHT, action_loss, tip_loss
 from hvs_suite.policies.belief.eye import sighting_loss
 from hvs_suite.policies.belief.network import BEGUN, N_JOINTS, SET_POINT, BeliefNetwork
 from hvs_suite.policies.belief.recorded import Recorded
-from hvs_suite.policies.network import geometry
 
 Parts = dict[str, Tensor]
 

@@ -19,7 +19,7 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
-from hvs_suite.policies.belief import arm
+from hvs_suite.policies.belief import arm, geometry
 from hvs_suite.policies.belief.belief import (
     ACCELERATION,
     BELIEF_SIZE,
@@ -33,9 +33,8 @@ from hvs_suite.policies.belief.belief import (
     View,
 )
 from hvs_suite.policies.belief.eye import LOG_DIAMETER, UV, VISIBLE, Eye
+from hvs_suite.policies.belief.geometry import FlangeMotion
 from hvs_suite.policies.belief.residual import RESIDUAL_SIZE, SHIFT, Residual, goal_axes
-from hvs_suite.policies.network import geometry
-from hvs_suite.policies.network.geometry import FlangeMotion
 
 N_JOINTS = 7
 ACTION_UNITS = 2.0**20

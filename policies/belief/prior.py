@@ -7,17 +7,17 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from hvs_suite.datasets.features import STATE
 from hvs_suite.policies.belief.belief import ACCELERATION, N_MOTION, PLACE, VELOCITY, Prior, View
+from hvs_suite.policies.belief.geometry import flange_motion
 from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
-from hvs_suite.policies.network.dataset import (
+from hvs_suite.policies.training.dataset import (
     EPISODE,
     GOAL_NORMAL,
     GOAL_POSITION,
     GOAL_VELOCITY,
     TARGET_PREFIX,
 )
-from hvs_suite.policies.network.geometry import flange_motion
-from hvs_suite.policies.network.network import STATE
 
 WIDER = 1.5
 """Variances are so much larger than those of the demonstrations: scenes to come may lie beyond."""

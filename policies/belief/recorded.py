@@ -9,16 +9,15 @@ import torch
 from torch import Tensor
 
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, set_point_after
-from hvs_suite.datasets.features import ACTION_EXECUTED
+from hvs_suite.datasets.features import ACTION_EXECUTED, STATE
 from hvs_suite.policies.belief.network import N_JOINTS
-from hvs_suite.policies.network.dataset import (
+from hvs_suite.policies.training.dataset import (
     EPISODE,
     GOAL_NORMAL,
     GOAL_POSITION,
     GOAL_VELOCITY,
     TARGET_PREFIX,
 )
-from hvs_suite.policies.network.network import STATE
 
 Column = npt.NDArray[np.generic]
 

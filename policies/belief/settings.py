@@ -11,13 +11,12 @@ from typing import Annotated, Any
 import numpy as np
 import pydantic
 
+from hvs_suite.datasets.features import IMAGES, OBSERVATION, STATE
 from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork, CellModel, Shape
-from hvs_suite.policies.network.network import IMAGE_PREFIX, STATE
 
 CAMERAS = ("eih", "eth")
 STATE_SIZE = 2 * N_JOINTS
 WRENCH_SIZE = 6
-VECTOR_PREFIX = "observation."
 _MOST_SIZE = 4096
 _ORTHONORMAL = 1e-6
 
@@ -106,14 +105,14 @@ class Settings(pydantic.BaseModel):
     def _fit(self) -> "Settings":
         cameras = self._cameras()
         if not cameras:
-            raise ValueError(f"it needs {' or '.join(IMAGE_PREFIX + name for name in CAMERAS)}")
+            raise ValueError(f"it needs {' or '.join(IMAGES + name for name in CAMERAS)}")
         wanted: dict[str, tuple[int, ...]] = {STATE: (STATE_SIZE,)}
         if self.wrench_key is not None:
             wanted[self.wrench_key] = (WRENCH_SIZE,)
         if self.goal_key is not None:
             wanted[self.goal_key] = self._shape(self.goal_key)[:1]
         for name, (channels, side) in cameras.items():
-            wanted[IMAGE_PREFIX + name] = (channels, side, side)
+            wanted[IMAGES + name] = (channels, side, side)
             if name not in CAMERAS or name not in self.cell.tan:
                 raise ValueError(f"it knows no camera {name[:80]!r}")
         for key, shape in wanted.items():
@@ -134,9 +133,9 @@ class Settings(pydantic.BaseModel):
 
     def _cameras(self) -> dict[str, tuple[int, int]]:
         return {
-            key.removeprefix(IMAGE_PREFIX): (feature.shape[0], feature.shape[-1])
+            key.removeprefix(IMAGES): (feature.shape[0], feature.shape[-1])
             for key, feature in sorted(self.input_features.items())
-            if key.startswith(IMAGE_PREFIX)
+            if key.startswith(IMAGES)
         }
 
     def shape(self) -> Shape:
@@ -168,11 +167,11 @@ def further_keys(keys: Mapping[str, object]) -> tuple[str | None, str | None]:
         ``observation.<...goal...>`` and ``observation.wrench``; None for what is not there.
     """
     vectors = [
-        key.removeprefix(VECTOR_PREFIX)
+        key.removeprefix(OBSERVATION)
         for key in sorted(keys)
-        if key.startswith(VECTOR_PREFIX) and not key.startswith(IMAGE_PREFIX)
+        if key.startswith(OBSERVATION) and not key.startswith(IMAGES)
     ]
     goal = next((name for name in vectors if "goal" in name), None)
     wrench = next((name for name in vectors if name == "wrench"), None)
-    named = [None if name is None else VECTOR_PREFIX + name for name in (goal, wrench)]
+    named = [None if name is None else OBSERVATION + name for name in (goal, wrench)]
     return named[0], named[1]

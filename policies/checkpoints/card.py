@@ -157,25 +157,24 @@ def _imitation_rows(trained: Mapping[str, Any], outcome: Mapping[str, Any]) -> d
         "the expert's labels"
         if rounds
         else "none",
-        "optimiser steps": f"{outcome['step']:,} of {settings['batch_size']} frames",
+        "optimiser steps": f"{outcome['step']:,}, in turns of the eyes on "
+        f"{settings['batch_size']} frames and of the rest on {settings['windows']} windows of "
+        f"{settings['window_steps']} frames",
         "supervision in training": f"{action}, and where the target is (`privileged.*`); neither "
-        "is an input"
-        if settings["keypoint_weight"] > 0
-        else action,
+        "is an input",
     }
 
 
 def _rl_rows(settings: Mapping[str, Any], outcome: Mapping[str, Any]) -> dict[str, str]:
     """What `finetune` did."""
-    looked = settings.get("eye_rounds", 0) * settings.get("eye_frames", 0)
     return {
         "fine-tuned from": f"a pretrained policy, weights `{settings['base'][:12]}`",
-        "eyes": f"{looked:,} frames of the policy's own episodes" if looked else "as they were",
-        "reinforcement learning": f"TD3 on a residual of {outcome['n_parameters']:,} parameters, "
-        f"{outcome['env_steps']:,} environment steps, {outcome['step']:,} updates of "
+        "reinforcement learning": "TD3 on a residual that moves the believed goal, of "
+        f"{outcome['n_parameters']:,} parameters, {outcome['env_steps']:,} environment steps, "
+        f"{outcome['step']:,} updates of "
         f"{settings['batch_size']} transitions",
-        "supervision in training": "the task's sparse reward, critics that see the simulator's "
-        "state, and for the eyes where the target is; no expert, and none of it is an input",
+        "supervision in training": "the task's sparse reward, and critics that see the simulator's "
+        "state; no expert, and none of it is an input",
     }
 
 
@@ -185,7 +184,7 @@ def _time(outcome: Mapping[str, Any], trained: Mapping[str, Any], was_fine_tuned
     if was_fine_tuned:
         players = trained["settings"]["environments"]
         where = f"{_count(players, 'process', 'processes')} playing while one learns"
-        return f"{hours:.2f} h, {where}; eyes and evaluations not counted"
+        return f"{hours:.2f} h, {where}; evaluations not counted"
     learning = _count(trained["threads"], "thread", "threads")
     return f"{hours:.2f} h, learning on {learning}; recording not counted"
 

@@ -25,7 +25,7 @@ PREPROCESSOR = "policy_preprocessor.json"
 POSTPROCESSOR = "policy_postprocessor.json"
 FILES = (CONFIG, WEIGHTS, PREPROCESSOR, POSTPROCESSOR)
 
-POLICIES = ("hvs", "hvs_belief", "act", "diffusion", "tdmpc", "vqbet")
+POLICIES = ("hvs", "act", "diffusion", "tdmpc", "vqbet")
 """LeRobot's names of the policies whose weights are all in the checkpoint."""
 STEPS = (
     "rename_observations_processor",

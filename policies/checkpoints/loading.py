@@ -1,6 +1,6 @@
 """Plays a checkpoint folder, ours or any other LeRobot policy's, in an environment.
 
-A checkpoint of type `hvs` or `hvs_belief` whose processors are the standard identity ones is played
+A checkpoint of type `hvs` whose processors are the standard identity ones is played
 by its network alone: LeRobot's policies take ten seconds and a gigabyte to import, in every worker.
 Tests hold that both ways give the same action. Anything else goes through LeRobot.
 """
@@ -9,38 +9,27 @@ import dataclasses
 import hashlib
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
-import pydantic
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from hvs_suite.datasets.features import IMAGES, OBSERVATION, STATE
 from hvs_suite.errors import PolicyError, first_line
 from hvs_suite.policies.belief.acting import CompiledBelief
-from hvs_suite.policies.belief.network import BeliefNetwork
+from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
 from hvs_suite.policies.belief.settings import Settings
 from hvs_suite.policies.checkpoints.files import (
-    MOST_SIZE,
     POSTPROCESSOR,
     PREPROCESSOR,
     WEIGHTS,
-    Size,
     check_sizes,
     check_weights,
     read_config,
     read_settings,
     read_steps,
-)
-from hvs_suite.policies.network.compiled import CompiledNetwork
-from hvs_suite.policies.network.network import (
-    IMAGE_PREFIX,
-    N_JOINTS,
-    RESIDUAL_BOUND,
-    STATE,
-    HvsNetwork,
-    shape_from_config,
 )
 from hvs_suite.policies.trained_for import OURS, check_trained_for
 from hvs_suite.rollout import Observation, one_torch_thread
@@ -51,8 +40,9 @@ Batch = dict[str, Any]
 """Tensors under LeRobot's names, and the task as a sentence."""
 Decide = Callable[[Batch], Tensor]
 
-VECTOR_PREFIX = "observation."
 TASK = "task"
+TYPE = "hvs"
+"""Of our own policy, as LeRobot names it."""
 
 # Where the network's own keys live in a checkpoint of the LeRobot policy around it.
 NETWORK_PREFIX = "network."
@@ -110,9 +100,8 @@ class CheckpointPolicy:
         check_fit(config, folder, spec)
         self._inputs = tuple(config["input_features"])
         with one_torch_thread():
-            alone = _ALONE.get(config["type"]) if _processors_are_standard(folder) else None
-            if alone is not None:
-                self._decide, self._forget = alone(folder, config)
+            if config["type"] == TYPE and _processors_are_standard(folder):
+                self._decide, self._forget = _network(folder, config)
             else:
                 self._decide, self._forget = _lerobot(folder)
         self._sentence = spec.instruction()
@@ -153,37 +142,20 @@ def as_batch(observation: Observation, keys: Iterable[str]) -> dict[str, Tensor]
     """
     batch: dict[str, Tensor] = {}
     for key in keys:
-        if key.startswith(IMAGE_PREFIX):
-            image = torch.from_numpy(observation[key.removeprefix(IMAGE_PREFIX)])
+        if key.startswith(IMAGES):
+            image = torch.from_numpy(observation[key.removeprefix(IMAGES)])
             batch[key] = image.permute(2, 0, 1).to(torch.float32) / 255.0
         elif key == STATE:
             parts = ["joint_positions", "joint_velocities"]
             joints = [observation[name] for name in parts if name in observation]
             batch[key] = torch.from_numpy(np.concatenate(joints).astype(np.float32))
         else:
-            vector = observation[key.removeprefix(VECTOR_PREFIX)]
+            vector = observation[key.removeprefix(OBSERVATION)]
             batch[key] = torch.from_numpy(vector.astype(np.float32))
     return batch
 
 
-def network_inputs(
-    network: HvsNetwork, observation: Observation
-) -> tuple[dict[str, Tensor], Tensor | None]:
-    """An observation as `HvsNetwork.forward` takes it, a batch of one.
-
-    Args:
-        network: Its shape says what it reads.
-        observation: As in `CheckpointPolicy.select_action`.
-
-    Returns:
-        Images by camera, and the state.
-    """
-    shape = network.shape
-    keys = [IMAGE_PREFIX + name for name in shape.cameras] + [STATE] * bool(shape.state_dim)
-    return _one(network, as_batch(observation, keys))
-
-
-class BeliefInputs(NamedTuple):
+class Inputs(NamedTuple):
     """An observation as `hvs_suite.policies.belief.acting.act` takes it, a batch of one."""
 
     images: dict[str, Tensor]
@@ -192,9 +164,9 @@ class BeliefInputs(NamedTuple):
     felt: Tensor | None
 
 
-def belief_inputs(
+def network_inputs(
     network: BeliefNetwork, config: Mapping[str, Any], observation: Observation
-) -> BeliefInputs:
+) -> Inputs:
     """An observation as a `BeliefNetwork` takes it.
 
     Args:
@@ -202,24 +174,17 @@ def belief_inputs(
         config: Of its checkpoint, which says what else it reads.
         observation: As in `CheckpointPolicy.select_action`.
     """
-    return _belief_inputs(network, config, as_batch(observation, config["input_features"]))
+    return _inputs(network, config, as_batch(observation, config["input_features"]))
 
 
-def _belief_inputs(network: BeliefNetwork, config: Mapping[str, Any], batch: Batch) -> BeliefInputs:
+def _inputs(network: BeliefNetwork, config: Mapping[str, Any], batch: Batch) -> Inputs:
     goal, wrench = config["goal_key"], config["wrench_key"]
-    return BeliefInputs(
-        {name: batch[IMAGE_PREFIX + name][None] for name in network.shape.cameras},
+    return Inputs(
+        {name: batch[IMAGES + name][None] for name in network.shape.cameras},
         batch[STATE][None],
         None if goal is None else batch[goal][None],
         None if wrench is None else batch[wrench][None],
     )
-
-
-def _one(
-    network: HvsNetwork, batch: Mapping[str, Tensor]
-) -> tuple[dict[str, Tensor], Tensor | None]:
-    images = {name: batch[IMAGE_PREFIX + name][None] for name in network.shape.cameras}
-    return images, batch[STATE][None] if network.shape.state_dim else None
 
 
 def check_fit(config: Mapping[str, Any], folder: Path, spec: Spec) -> None:
@@ -245,7 +210,7 @@ def check_fit(config: Mapping[str, Any], folder: Path, spec: Spec) -> None:
         )
     for key, feature in config["input_features"].items():
         shape = tuple(feature["shape"])
-        name = key.removeprefix(IMAGE_PREFIX)
+        name = key.removeprefix(IMAGES)
         if key == STATE:
             available = N_JOINTS * sum(
                 part in shown for part in ("joint_positions", "joint_velocities")
@@ -254,7 +219,7 @@ def check_fit(config: Mapping[str, Any], folder: Path, spec: Spec) -> None:
                 raise PolicyError(
                     mismatch + f"it reads {shape[0]} joint numbers, the task shows {available}"
                 )
-        elif (vector := key.removeprefix(VECTOR_PREFIX)) in spec.further_observations:
+        elif (vector := key.removeprefix(OBSERVATION)) in spec.further_observations:
             size = len(spec.further_observations[vector].dimensions)
             if vector not in shown or shape != (size,):
                 raise PolicyError(mismatch + f"it reads {key}, which the task shows otherwise")
@@ -288,53 +253,28 @@ def _processors_are_standard(folder: Path) -> bool:
     return True
 
 
-class _Sizes(pydantic.BaseModel):
-    """What decides the size of an `hvs` network."""
-
-    model_config = pydantic.ConfigDict(extra="allow")
-
-    channels: Annotated[Size, pydantic.Field(ge=4)]
-    hidden: Annotated[Size, pydantic.Field(ge=4)]
-    error_scale: Annotated[float, pydantic.Field(gt=0.0, allow_inf_nan=False)]
-    residual_hidden: Annotated[int, pydantic.Field(strict=True, ge=0, le=MOST_SIZE)] = 0
-    residual_bound: Annotated[float, pydantic.Field(gt=0.0, allow_inf_nan=False)] = RESIDUAL_BOUND
-    from_set_point: Annotated[bool, pydantic.Field(strict=True)] = False
-
-
-def load_network(folder: Path, config: Mapping[str, Any]) -> HvsNetwork:
+def load_network(folder: Path) -> BeliefNetwork:
     """Load the network of an `hvs` checkpoint, without LeRobot.
 
     Args:
         folder: The checkpoint.
-        config: Its ``config.json``, as `read_config` returns it.
+
+    Returns:
+        The network, in evaluation mode.
 
     Raises:
-        PolicyError: It cannot be loaded.
+        PolicyError: It is of another policy, or cannot be loaded.
     """
-    read_settings(_Sizes, folder)
-    return _with_weights(folder, lambda: HvsNetwork(shape_from_config(config)))
-
-
-def load_belief_network(folder: Path) -> BeliefNetwork:
-    """Load the network of an `hvs_belief` checkpoint, without LeRobot.
-
-    Args:
-        folder: The checkpoint, which `read_config` has checked.
-
-    Raises:
-        PolicyError: It cannot be loaded.
-    """
-    return _with_weights(folder, read_settings(Settings, folder).network)
-
-
-def _with_weights[Network: nn.Module](folder: Path, make: Callable[[], Network]) -> Network:
-    """A network with the weights of a checkpoint, in evaluation mode."""
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
-    check_weights(folder, make, NETWORK_PREFIX)
+    config = read_config(folder)
+    if config["type"] != TYPE:
+        raise PolicyError(f"{folder} holds a policy of type {config['type']}, not {TYPE}")
+    settings = read_settings(Settings, folder)
+    check_weights(folder, settings.network, NETWORK_PREFIX)
     try:
-        network = make()
+        network = settings.network()
         weights = load_file(folder / WEIGHTS)
         network.load_state_dict({k.removeprefix(NETWORK_PREFIX): v for k, v in weights.items()})
     except (SafetensorError, OSError, RuntimeError) as error:
@@ -362,38 +302,14 @@ Player = tuple[Decide, Callable[[], None]]
 
 def _network(folder: Path, config: Mapping[str, Any]) -> Player:
     """Play the network of an `hvs` checkpoint by itself."""
-    network = load_network(folder, config)
-    if not network.shape.state_dim:
-        return lambda batch: network.to_action(network(*_one(network, batch)).out, None), _nothing
-    compiled = CompiledNetwork(network)
-
-    def step(batch: Batch, memory: Tensor | None) -> tuple[Tensor, Tensor]:
-        images, state = _one(network, batch)
-        assert state is not None
-        return compiled(images, state, memory)
-
-    return _remembering(step)
-
-
-def _belief(folder: Path, config: Mapping[str, Any]) -> Player:
-    """Play the network of an `hvs_belief` checkpoint by itself."""
-    network = load_belief_network(folder)
+    network = load_network(folder)
     compiled = CompiledBelief(network)
-
-    def step(batch: Batch, memory: Tensor | None) -> tuple[Tensor, Tensor]:
-        inputs = _belief_inputs(network, config, batch)
-        return compiled(inputs.images, inputs.state, memory, inputs.goal, inputs.felt)
-
-    return _remembering(step)
-
-
-def _remembering(step: Callable[[Batch, Tensor | None], tuple[Tensor, Tensor]]) -> Player:
-    """Keep the memory between the steps of a network."""
     memory: Tensor | None = None
 
     def decide(batch: Batch) -> Tensor:
         nonlocal memory
-        action, memory = step(batch, memory)
+        inputs = _inputs(network, config, batch)
+        action, memory = compiled(inputs.images, inputs.state, memory, inputs.goal, inputs.felt)
         return action
 
     def forget() -> None:
@@ -403,17 +319,6 @@ def _remembering(step: Callable[[Batch, Tensor | None], tuple[Tensor, Tensor]]) 
     return decide, forget
 
 
-def _nothing() -> None:
-    """Forget nothing: a policy without joints has no memory."""
-
-
-_ALONE: Mapping[str, Callable[[Path, Mapping[str, Any]], Player]] = {
-    "hvs": _network,
-    "hvs_belief": _belief,
-}
-"""Types of policies whose networks are played without LeRobot."""
-
-
 def _lerobot(folder: Path) -> Player:
     """Load any LeRobot policy with its processors, on the CPU."""
     try:
@@ -421,8 +326,7 @@ def _lerobot(folder: Path) -> Player:
         from lerobot.policies.factory import get_policy_class, make_pre_post_processors
     except ImportError as error:
         raise PolicyError("LeRobot is missing; install hvs-suite[learn]") from error
-    import hvs_suite.policies.hvs
-    import hvs_suite.policies.hvs_belief  # noqa: F401 - they register the types
+    import hvs_suite.policies.hvs  # noqa: F401 - registers the type
 
     try:
         config = PreTrainedConfig.from_pretrained(folder, local_files_only=True)

@@ -1,4 +1,4 @@
-"""The suite's visuomotor policy as a LeRobot policy: configuration, modeling, processor.
+"""The `hvs` policy as a LeRobot policy: configuration, modeling, processor.
 
 Importing this package registers the type ``hvs``, after which LeRobot's own
 ``PreTrainedConfig.from_pretrained(folder)`` reads its checkpoints; LeRobot's tools import it with

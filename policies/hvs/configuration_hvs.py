@@ -1,24 +1,16 @@
 """Configuration of the `hvs` policy."""
 
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
-from lerobot.utils.constants import OBS_STATE
 
-from hvs_suite.policies.network.network import (
-    ERROR_SCALE,
-    IMAGE_PREFIX,
-    N_JOINTS,
-    POSITIONS_AND_VELOCITIES,
-    RESIDUAL_BOUND,
-    Shape,
-)
+from hvs_suite.errors import PolicyError
+from hvs_suite.policies.belief.network import N_JOINTS, Shape
+from hvs_suite.policies.belief.settings import Settings, further_keys
 from hvs_suite.policies.trained_for import CONTROL_PERIOD_S, FAMILY
-
-CAMERAS = ("eih", "eth")
+from hvs_suite.reading import validated
 
 
 @PreTrainedConfig.register_subclass("hvs")
@@ -26,27 +18,32 @@ CAMERAS = ("eih", "eth")
 class HvsConfig(PreTrainedConfig):
     """Configuration of the `hvs` policy.
 
-    Inputs are any of ``observation.images.eih``, ``observation.images.eth`` (square) and
-    ``observation.state``, at least one of them an image. The output is ``action``: seven joint
-    position targets in units of the joint range.
+    Inputs are ``observation.images.eih``, ``observation.images.eth`` (square) or both,
+    ``observation.state`` (14), and what `goal_key` and `wrench_key` name. The output is ``action``:
+    seven joint position targets in units of the joint range.
 
     Attributes:
-        normalization_mapping: All identity: the network scales images and joints itself.
-        channels: Channels of the image encoders.
-        hidden: Width of the perceptron that decides.
+        normalization_mapping: All identity: the network scales images and numbers itself.
+        channels: Channels of the eyes.
+        hidden: Width of the head.
         error_scale: Below this, errors weigh linearly, above logarithmically: of a joint's step
             (rad) and of a place (m). Some five times the tolerance that is aimed at.
-        residual_hidden: Width of the residual that ``hvs finetune`` learns; 0 for none.
-        residual_bound: The most that it adds to the output of the head.
-        from_set_point: Joint steps are counted from where the arm has been sent, and not from where
-            it stands; for a policy that learned with that in its memory, of an arm with latency
-            (docs/experiments/from-set-point.md).
+        goal_key: Input that says which target is meant, one-hot; None without. A new policy takes
+            the one of its inputs that has ``goal`` in its name.
+        wrench_key: Input that holds force and torque, (6,) N and Nm; None without. A new policy
+            takes ``observation.wrench`` if that is one of its inputs.
+        cell: What is known of the cell beforehand, as `hvs_suite.policies.belief.settings.Cell`
+            has it; None for a new policy, which takes that of its dataset's task.
+        residual_hidden: Width of the residual that RL has learned; 0 without one.
+        residual_step_m: The most that it moves the goal in a step: sideways, and along the normal
+            (m).
+        residual_reach_m: How far from the believed goal it does (m).
         family: Family of the tasks that it was trained for.
         control_period_s: Length of their control step (s).
         options: Options of the task that it was trained with, where they differ from the named one;
-            `hvs_suite.policies.trained_for` compares them with the task to be played.
-        keypoint_weight: Weight of the losses against the projected target and its place in space,
-            where the dataset has ``privileged.*`` columns; 0 trains on actions alone.
+            `hvs_suite.policies.trained_for` holds them against what is to be played.
+        window: Frames of the sequences that stock ``lerobot-train`` trains on, the memory with
+            them. Where less of the episode came before, the window is padded.
         optimizer_lr: Peak learning rate of stock ``lerobot-train``.
         optimizer_weight_decay: AdamW's weight decay.
     """
@@ -60,77 +57,61 @@ class HvsConfig(PreTrainedConfig):
     )
     channels: int = 32
     hidden: int = 256
-    error_scale: float = ERROR_SCALE
+    error_scale: float = 0.005
+    goal_key: str | None = None
+    wrench_key: str | None = None
+    cell: dict[str, Any] | None = None
     residual_hidden: int = 0
-    residual_bound: float = RESIDUAL_BOUND
-    from_set_point: bool = False
+    residual_step_m: tuple[float, float] = Shape.residual_step_m
+    residual_reach_m: float = Shape.residual_reach_m
     family: str = FAMILY
     control_period_s: float = CONTROL_PERIOD_S
     options: dict[str, Any] = field(default_factory=dict)
-    keypoint_weight: float = 1.0
+    window: int = 16
     optimizer_lr: float = 2e-3
     optimizer_weight_decay: float = 1e-4
 
     def __post_init__(self) -> None:
-        """Refuse sizes that no network can have."""
+        """Refuse training that makes no sense; the network's own sizes see `settings`."""
         super().__post_init__()
-        if self.channels < 4 or self.hidden < 4:
-            raise ValueError(
-                f"`channels` and `hidden` must be at least 4, got {self.channels} and "
-                f"{self.hidden}."
-            )
-        if not 0 < self.error_scale < math.inf:
-            raise ValueError(f"`error_scale` must be above 0, got {self.error_scale}.")
-        if self.residual_hidden < 0 or not 0 < self.residual_bound < math.inf:
-            raise ValueError(
-                "`residual_hidden` must not be negative and `residual_bound` above 0, got "
-                f"{self.residual_hidden} and {self.residual_bound}."
-            )
-        if self.keypoint_weight < 0:
-            raise ValueError(f"`keypoint_weight` must not be negative, got {self.keypoint_weight}.")
+        if self.window < 1:
+            raise ValueError(f"`window` must be at least 1, got {self.window}.")
         if self.n_obs_steps != 1:
             raise ValueError(f"The policy reads one observation, got {self.n_obs_steps=}.")
+
+    def name_inputs(self) -> None:
+        """Set which of a new policy's inputs are goal and wrench, unless they are set already."""
+        goal, wrench = further_keys(self.input_features or {})
+        self.goal_key = self.goal_key or goal
+        self.wrench_key = self.wrench_key or wrench
 
     def validate_features(self) -> None:
         """Check that the network can read these inputs and drive this robot.
 
         Raises:
-            ValueError: An input or the action has a name or shape that the network has no use for.
+            ValueError: An input or the action has a name or shape that the network has no use for,
+                or a size is none that a network can have.
         """
-        if not self.image_features:
-            raise ValueError("The policy needs `observation.images.eih`, `.eth` or both.")
-        for key, feature in self.image_features.items():
-            if key.removeprefix(IMAGE_PREFIX) not in CAMERAS:
-                raise ValueError(f"Unknown camera `{key}`; the policy knows {', '.join(CAMERAS)}.")
-            if len(feature.shape) != 3 or feature.shape[1] != feature.shape[2]:
-                raise ValueError(f"`{key}` must be a square (C, H, W) image, got {feature.shape}.")
-        state = self.robot_state_feature
-        if state is not None and state.shape[0] not in (N_JOINTS, POSITIONS_AND_VELOCITIES):
-            raise ValueError(
-                f"`{OBS_STATE}` must hold 7 joint positions, or 7 positions and 7 velocities, got "
-                f"{state.shape[0]} numbers."
-            )
+        self.settings()
         action = self.action_feature
         if action is None or tuple(action.shape) != (N_JOINTS,):
             raise ValueError("`action` must hold 7 joint position targets.")
 
-    def shape(self) -> Shape:
-        """Sizes of the network for these inputs."""
-        cameras = {
-            key.removeprefix(IMAGE_PREFIX): (feature.shape[0], feature.shape[1])
-            for key, feature in sorted(self.image_features.items())
+    def settings(self) -> Settings:
+        """What of this decides which network there is.
+
+        Raises:
+            ValueError: There is no such network.
+        """
+        inputs = {key: {"shape": list(f.shape)} for key, f in (self.input_features or {}).items()}
+        content = {
+            **{name: getattr(self, name) for name in Settings.model_fields},
+            "input_features": inputs,
         }
-        state = self.robot_state_feature
-        return Shape(
-            cameras,
-            state.shape[0] if state else 0,
-            self.channels,
-            self.hidden,
-            self.error_scale,
-            self.residual_hidden,
-            self.residual_bound,
-            self.from_set_point,
-        )
+        try:
+            return validated(Settings, content, "configuration", error=PolicyError)
+        except PolicyError as error:
+            raise ValueError(str(error)) from error
 
     def get_optimizer_preset(self) -> AdamWConfig:
         """AdamW with this configuration's rate and decay."""
@@ -148,14 +129,14 @@ class HvsConfig(PreTrainedConfig):
         )
 
     @property
-    def observation_delta_indices(self) -> None:
-        """One observation, the present one."""
-        return None
+    def observation_delta_indices(self) -> list[int]:
+        """The present observation and those before it."""
+        return list(range(1 - self.window, 1))
 
     @property
-    def action_delta_indices(self) -> None:
-        """One action, the present one."""
-        return None
+    def action_delta_indices(self) -> list[int]:
+        """The actions of the same frames."""
+        return self.observation_delta_indices
 
     @property
     def reward_delta_indices(self) -> None:

@@ -1,7 +1,5 @@
-"""The `hvs` network behind LeRobot's policy interface."""
+"""The network with a belief behind LeRobot's policy interface."""
 
-import dataclasses
-import logging
 from pathlib import Path
 from typing import Any
 
@@ -10,57 +8,43 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from hvs_suite.errors import DatasetError
+from hvs_suite.datasets.features import IMAGES
+from hvs_suite.policies.belief.acting import act
+from hvs_suite.policies.belief.cell_model import cell_model
+from hvs_suite.policies.belief.eye import SIGHTING_SIZE
+from hvs_suite.policies.belief.lessons import Window, eye_lesson, window_lesson
+from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
+from hvs_suite.policies.belief.prior import take_prior
+from hvs_suite.policies.belief.recorded import Recorded, recorded, recorded_keys
+from hvs_suite.policies.belief.settings import as_numbers
 from hvs_suite.policies.hvs.configuration_hvs import HvsConfig
-from hvs_suite.policies.network.dataset import (
-    GOAL_NORMAL,
-    GOAL_POSITION,
-    TARGET_PREFIX,
-    calibration_of,
-)
-from hvs_suite.policies.network.network import (
-    IMAGE_PREFIX,
-    MEMORY,
-    Decision,
-    HvsNetwork,
-    Sighting,
-    action_loss,
-    flange_loss,
-    sighting_loss,
-    target_loss,
-)
-from hvs_suite.policies.network.rehearsal import drawn_sightings
+from hvs_suite.policies.trained_for import trained_for
 from hvs_suite.policies.training.checkpoint import write_checkpoint
+from hvs_suite.policies.training.dataset import (
+    GOAL_VELOCITY,
+    Manifest,
+    read_columns,
+    read_manifest,
+)
+from hvs_suite.registry import find
 
-logger = logging.getLogger(__name__)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Lesson:
-    """What a batch teaches.
-
-    Attributes:
-        loss: Scalar to learn from.
-        parts: What it is made of, as numbers.
-        sightings: Camera name to what its eye made of the batch.
-        truths: Camera name to where the target was: u, v, apparent diameter in image widths, and 1
-            where it can be seen, (B, 4); empty without keypoint supervision.
-    """
-
-    loss: Tensor
-    parts: dict[str, float]
-    sightings: dict[str, Sighting]
-    truths: dict[str, Tensor]
+INDEX = "index"
+PADDED = f"{OBS_STATE}_is_pad"
 
 
 class HvsPolicy(PreTrainedPolicy):
-    """Two images and the joints in, seven joint position targets out.
+    """Images, joints, goal and wrench in, seven joint position targets out.
 
     Args:
         config: Inputs and sizes.
-        dataset_meta: Given by LeRobot's factory: a new policy takes the camera calibration from
-            that dataset's privileged columns, if it has them.
+        dataset_meta: Of the dataset that is to be learned from, which LeRobot's factory gives. A
+            new policy takes from it what it is trained for, the cell and the prior of its belief;
+            and every policy what training alone may see, which LeRobot makes no windows of.
         **kwargs: What else LeRobot's factory passes; not used.
+
+    Raises:
+        ValueError: The network cannot read these inputs, or the description of the cell is missing.
+        DatasetError: The dataset was not recorded by this suite, or is damaged.
     """
 
     config_class = HvsConfig
@@ -68,142 +52,125 @@ class HvsPolicy(PreTrainedPolicy):
 
     def __init__(self, config: HvsConfig, dataset_meta: Any = None, **kwargs: Any) -> None:
         super().__init__(config)
-        config.validate_features()
         self.config: HvsConfig = config
-        self.network = HvsNetwork(config.shape())
-        self._warned = False
+        is_new = not config.pretrained_path
+        manifest = None if dataset_meta is None else read_manifest(Path(dataset_meta.root))
+        if is_new:
+            config.name_inputs()
+            if manifest is not None:
+                _take_over(config, manifest)
+        config.validate_features()
+        self.network: BeliefNetwork = config.settings().network()
+        self._recorded: Recorded | None = None
         self._memory: Tensor | None = None
-        if dataset_meta is not None and not config.pretrained_path:
-            self._calibrate_from(Path(dataset_meta.root))
+        if manifest is not None:
+            self._learn_of(manifest, with_prior=is_new)
 
-    def _calibrate_from(self, root: Path) -> None:
-        try:
-            self.network.set_calibration(calibration_of(root))
-        except DatasetError as error:
-            logger.warning("no camera calibration from this dataset: %s", error)
+    def _learn_of(self, manifest: Manifest, *, with_prior: bool) -> None:
+        cameras, period_s = tuple(self.network.shape.cameras), self.config.control_period_s
+        further = [GOAL_VELOCITY] if GOAL_VELOCITY in manifest.features else []
+        columns = read_columns(manifest, [*recorded_keys(cameras), *further])
+        self._recorded = recorded(columns, cameras, period_s)
+        if with_prior:
+            take_prior(self.network, columns)
 
     def get_optim_params(self) -> Any:
         """All parameters, in one group."""
         return self.parameters()
 
     def reset(self) -> None:
-        """Forget where the target was seen: a new episode begins."""
+        """Forget what is believed: a new episode begins."""
         self._memory = None
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
-        """Loss of a batch; LeRobot's interface to `supervise`.
+        """Loss of a batch of windows: the memory goes through each, and is trained with the rest.
+
+        Each window begins with a fresh belief, wherever in its episode. What belief and head make
+        of the sightings does not reach the eyes, which learn from where the target is.
 
         Args:
-            batch: As `supervise` takes it.
+            batch: The inputs (B, T, ...), images uint8, or float in [0, 1], and ``action``
+                (B, T, 7); ``observation.state_is_pad`` (B, T), true for frames before the beginning
+                of the episode, none if it is missing; ``index`` (B,), the last frame's number in
+                the dataset.
 
         Returns:
             The loss, and its parts as numbers.
+
+        Raises:
+            ValueError: The policy was made without a dataset.
         """
-        lesson = self.supervise(batch)
-        return lesson.loss, lesson.parts
+        if self._recorded is None:
+            raise ValueError("training needs `dataset_meta`, whose columns say where the goal is")
+        network = self.network
+        state = batch[OBS_STATE]
+        n, length = state.shape[:2]
+        padded = batch.get(PADDED, torch.zeros_like(state[:, :, 0], dtype=torch.bool))
+        # LeRobot's windows end with a certain frame, lessons begin with one.
+        order = (
+            torch.arange(n, device=state.device)[:, None],
+            padded.int().argsort(dim=1, stable=True),
+        )
+        counts = ~padded[order]
+        before = torch.arange(1 - length, 1, device=state.device)
+        rows = (batch[INDEX].reshape(n, 1) + before)[order].clamp(min=0)
+        truth = self._recorded.at(rows.cpu()).to(state.device)
+        inputs = {
+            key: value[order]
+            for key, value in batch.items()
+            if key in self.config.input_features or key == ACTION
+        }
+        goal, felt = self._further(inputs)
+        images = {name: inputs[IMAGES + name][counts] for name in network.shape.cameras}
+        sightings = network.look(images, None if goal is None else goal[counts])
+        eyes, of_eyes = eye_lesson(
+            network, sightings, inputs[OBS_STATE][counts][:, :N_JOINTS], truth.at(counts)
+        )
+        windows = {}
+        for name, sighting in sightings.items():
+            windows[name] = sighting.new_zeros(n, length, SIGHTING_SIZE)
+            windows[name][counts] = sighting.detach()
+        window = Window(
+            memory=network.start(n),
+            sightings=windows,
+            state=inputs[OBS_STATE],
+            action=inputs[ACTION],
+            truth=truth,
+            felt=felt,
+            counts=counts,
+        )
+        rest, of_rest = window_lesson(network, window)
+        return eyes + rest, {k: v.detach().item() for k, v in {**of_eyes, **of_rest}.items()}
 
-    def supervise(self, batch: dict[str, Tensor]) -> Lesson:
-        """Compare the network's output for a batch with the truth.
-
-        Args:
-            batch: The inputs (images uint8, or float in [0, 1]), ``action`` (B, 7), and where the
-                dataset has them ``privileged.target_<camera>`` (B, 4),
-                ``privileged.goal_position`` and ``privileged.goal_normal`` (B, 3); ``memory``
-                (B, 4 n + 10) what a policy with n cameras remembers, nothing if it is missing.
-
-        Returns:
-            The loss, and what else can be learned from it.
-        """
-        images, state = self._inputs(batch)
-        decision = self.network(images, state, batch.get(MEMORY))
-        loss, parts = self._control_loss(decision, batch, state)
-        weight = self.config.keypoint_weight
-        truths = self._truths(batch) if weight > 0 else {}
-        for camera, truth in truths.items():
-            part = sighting_loss(decision.sightings[camera], truth)
-            parts[f"{camera}_loss"] = part.detach()
-            loss = loss + weight * part
-        target = decision.target
-        if weight > 0 and target is not None and GOAL_POSITION in batch and GOAL_NORMAL in batch:
-            place = batch[GOAL_POSITION] - self.network.standoff * batch[GOAL_NORMAL]
-            part = target_loss(target, place, self.config.error_scale)
-            parts["target_loss"] = part.detach()
-            loss = loss + 0.1 * weight * part
-        if self.training and weight > 0 and not truths and not self._warned:
-            logger.warning(
-                "training without keypoint supervision: the batch has no `privileged.target_*`"
-            )
-            self._warned = True
-        numbers = {name: part.item() for name, part in parts.items()}
-        return Lesson(loss, numbers, decision.sightings, truths)
-
-    def rehearse(
-        self, batch: dict[str, Tensor], lesson: Lesson, generator: torch.Generator
-    ) -> Tensor:
-        """Loss of the head on frames without images, see `hvs_suite.policies.network.rehearsal`.
-
-        Args:
-            batch: As in `supervise`, images left out.
-            lesson: From other frames: what the eyes saw in those decides what they would have seen
-                in these.
-            generator: For the draws.
-
-        Returns:
-            The loss; 0 if the batch does not tell where the targets are.
-        """
-        state = batch[OBS_STATE] if self.network.shape.state_dim else None
-        if set(lesson.truths) != set(self.network.shape.cameras) or state is None:
-            return self.network.step_gain.new_zeros(())
-        drawn = drawn_sightings(lesson.sightings, lesson.truths, self._truths(batch), generator)
-        decision = self.network.decide(drawn, state, batch.get(MEMORY))
-        return self._control_loss(decision, batch, state)[0]
-
-    def _control_loss(
-        self, decision: Decision, batch: dict[str, Tensor], state: Tensor | None
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Loss of the expert's step, joint by joint and at the flange, and its parts."""
-        label = self.network.encode_label(batch[ACTION], self._origin(decision, state))
-        loss = action_loss(decision.out, label)
-        parts = {"action_loss": loss.detach()}
-        if (
-            self.config.keypoint_weight > 0
-            and decision.motion is not None
-            and GOAL_POSITION in batch
-            and GOAL_NORMAL in batch
-        ):
-            astray = self.network.to_step(decision.out) - self.network.to_step(label)
-            distance = batch[GOAL_POSITION] - decision.motion.position
-            part = flange_loss(
-                astray,
-                decision.motion,
-                distance.norm(dim=1, keepdim=True),
-                self.config.error_scale,
-            )
-            parts["flange_loss"] = part.detach()
-            loss = loss + 0.3 * part
-        return loss, parts
-
-    def _origin(self, decision: Decision, state: Tensor | None) -> Tensor | None:
-        if state is None or decision.memory is None:
-            return None
-        return self.network.origin(state, decision.memory)
-
-    def _truths(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Where the target is in each camera's images, as far as the batch tells."""
-        keys = {camera: TARGET_PREFIX + camera for camera in self.network.shape.cameras}
-        return {camera: batch[key] for camera, key in keys.items() if key in batch}
+    def _further(self, batch: dict[str, Tensor]) -> tuple[Tensor | None, Tensor | None]:
+        """Which target is meant, and the wrench, of those policies that are told."""
+        goal, wrench = (
+            None if key is None else batch[key].float()
+            for key in (self.config.goal_key, self.config.wrench_key)
+        )
+        return goal, wrench
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Chunk of one action, (B, 1, 7) in [-1, 1]; one call an observation, for its memory."""
         self.eval()
-        images, state = self._inputs(batch)
-        if self._memory is not None and len(self._memory) != len(next(iter(images.values()))):
-            self._memory = None  # Other environments than before.
-        decision = self.network(images, state, self._memory)
-        action = self.network.to_action(decision.out, self._origin(decision, state))
-        if decision.memory is not None:
-            self._memory = self.network.commanded(decision.memory, action)
+        state = batch[OBS_STATE]
+        if self._memory is None or len(self._memory) != len(state):
+            # A new episode, or other environments than before.
+            self._memory = self.network.start(len(state))
+        # LeRobot's pre-processor makes batches of one of states and images alone.
+        goal, felt = (
+            None if vector is None else vector.reshape(len(state), -1)
+            for vector in self._further(batch)
+        )
+        action, self._memory = act(
+            self.network,
+            {name: batch[IMAGES + name] for name in self.network.shape.cameras},
+            state,
+            self._memory,
+            goal,
+            felt,
+        )
         return action[:, None]
 
     @torch.no_grad()
@@ -211,8 +178,8 @@ class HvsPolicy(PreTrainedPolicy):
         """Joint position targets in units of the joint range, (B, 7) in [-1, 1].
 
         Args:
-            batch: Images (B, C, H, W) in [0, 1] and the state (B, 14) in rad and rad/s; other
-                keys are not looked at.
+            batch: Images (B, C, H, W) in [0, 1], the state (B, 14) in rad and rad/s, and what else
+                are inputs; other keys are not looked at.
             **kwargs: What LeRobot passes to policies with random actions; not used.
 
         Returns:
@@ -220,9 +187,13 @@ class HvsPolicy(PreTrainedPolicy):
         """
         return self.predict_action_chunk(batch)[:, 0]
 
-    def _inputs(self, batch: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor | None]:
-        images = {name: batch[IMAGE_PREFIX + name] for name in self.network.shape.cameras}
-        return images, batch[OBS_STATE] if self.network.shape.state_dim else None
+
+def _take_over(config: HvsConfig, manifest: Manifest) -> None:
+    """Take what a policy is trained for, and its cell, from a dataset."""
+    spec = find(manifest.task).with_options(manifest.options)
+    for name, value in trained_for(spec).model_dump().items():
+        setattr(config, name, value)
+    config.cell = as_numbers(cell_model(spec))
 
 
 def save_checkpoint(policy: HvsPolicy, folder: Path) -> None:
@@ -235,6 +206,8 @@ def save_checkpoint(policy: HvsPolicy, folder: Path) -> None:
     Raises:
         OutputError: It cannot be written; what stood there before still does.
     """
-    from hvs_suite.policies.hvs.processor_hvs import make_hvs_pre_post_processors
+    from hvs_suite.policies.hvs.processor_hvs import (
+        make_hvs_pre_post_processors,
+    )
 
-    write_checkpoint(policy, make_hvs_pre_post_processors(policy.config), folder)
+    write_checkpoint(policy, make_hvs_pre_post_processors(policy.config), folder, half=True)

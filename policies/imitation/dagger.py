@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.datasets.demonstration import MakeEnvironment
-from hvs_suite.datasets.features import ACTION, ACTION_EXECUTED, Frame, observed_part
+from hvs_suite.datasets.features import ACTION, ACTION_EXECUTED, IMAGES, Frame, observed_part
 from hvs_suite.datasets.looking import Demonstrator
 from hvs_suite.datasets.png import encode
 from hvs_suite.datasets.recorder import in_order
@@ -26,8 +26,7 @@ from hvs_suite.executor import Workers
 from hvs_suite.policies.checkpoints.loading import CheckpointFactory
 from hvs_suite.policies.imitation.demonstrations import Recording
 from hvs_suite.policies.imitation.frame_cache import new_frames, open_frames
-from hvs_suite.policies.network.dataset import Manifest
-from hvs_suite.policies.network.network import IMAGE_PREFIX
+from hvs_suite.policies.training.dataset import Manifest
 from hvs_suite.reading import decode_png
 from hvs_suite.rollout import Policy, play, tell
 
@@ -60,8 +59,7 @@ class PlayedEpisode:
 
     Attributes:
         scenario: Index in the split.
-        frames: One a control step, pictures left out, with the expert's ``action`` where it was
-            asked.
+        frames: One a control step, pictures left out, with the expert's ``action``.
         pictures: PNG files of each camera's feature, one a frame: they may come from far away.
         success: The goal was reached.
         collision: A forbidden contact ended it.
@@ -72,20 +70,6 @@ class PlayedEpisode:
     pictures: Mapping[str, list[bytes]]
     success: bool
     collision: bool
-
-
-def watch(env: "Environment", policy: Policy, scenario: int) -> PlayedEpisode:
-    """Play one scenario with the policy and keep what it saw, asking no expert.
-
-    Args:
-        env: The task.
-        policy: The policy that plays.
-        scenario: Index in the split.
-
-    Returns:
-        The episode, its frames without ``action``.
-    """
-    return _played(env, policy, scenario, dict)
 
 
 def correct(env: "Environment", policy: Policy, scenario: int) -> PlayedEpisode:
@@ -100,23 +84,17 @@ def correct(env: "Environment", policy: Policy, scenario: int) -> PlayedEpisode:
         The episode.
     """
     expert = Demonstrator(env)
-    return _played(env, policy, scenario, lambda: {ACTION: expert.label()})
-
-
-def _played(
-    env: "Environment", policy: Policy, scenario: int, label: Callable[[], Frame]
-) -> PlayedEpisode:
     time_step = env.reset(scenario=scenario)
     tell(policy, env)
     policy.reset()
     frames: list[Frame] = []
     while not time_step.last():
         frame = observed_part(env.spec, time_step.observation, env)
-        labelled = frame | label()
+        frame[ACTION] = expert.label()
         action = np.clip(policy.select_action(time_step.observation), -1.0, 1.0).astype(np.float32)
-        frames.append(labelled | {ACTION_EXECUTED: action})
+        frames.append(frame | {ACTION_EXECUTED: action})
         time_step = env.step(action)
-    cameras = [key for key in frames[0] if key.startswith(IMAGE_PREFIX)]
+    cameras = [key for key in frames[0] if key.startswith(IMAGES)]
     pictures = {key: encode([frame.pop(key) for frame in frames]) for key in cameras}
     info = env.info
     return PlayedEpisode(scenario, frames, pictures, info["is_success"], info["collision"])
@@ -151,7 +129,6 @@ def play_round(
     frames: int,
     first_scenario: int,
     workers: Workers,
-    labelled: bool = True,
     on_frames: Callable[[int], None] | None = None,
 ) -> RoundSummary:
     """Play scenarios until enough frames are there, and keep them on disk.
@@ -163,7 +140,6 @@ def play_round(
         frames: How many to keep.
         first_scenario: Index to begin with; give one that the dataset does not hold.
         workers: Processes that play, or others elsewhere. The result is the same with any of them.
-        labelled: Ask the expert at every step what it would have done.
         on_frames: Called with the number of frames just kept.
 
     Returns:
@@ -173,15 +149,13 @@ def play_round(
         OutputError: The folder cannot be written.
     """
     scratch = folder.with_name(f".{folder.name}")
-    keys = {
-        key: manifest.features[key] for key in manifest.trained_keys if labelled or key != ACTION
-    }
+    keys = {key: manifest.features[key] for key in manifest.trained_keys}
     played = play(
         MakeEnvironment(manifest.task, manifest.split, dict(manifest.options)),
         CheckpointFactory(str(checkpoint.resolve())),
         # No episode is without a frame, so these are enough.
         range(first_scenario, first_scenario + frames),
-        correct if labelled else watch,
+        correct,
         workers=workers,
     )
     try:
@@ -224,7 +198,7 @@ def read_round(folder: Path) -> tuple[RoundSummary, Recording] | None:
     summary = RoundSummary(**json.loads((folder / SUMMARY).read_text()))
     with np.load(folder / COLUMNS, allow_pickle=False) as file:
         columns = dict(file)
-    images = {path.stem: open_frames(path) for path in sorted(folder.glob(f"{IMAGE_PREFIX}*.npy"))}
+    images = {path.stem: open_frames(path) for path in sorted(folder.glob(f"{IMAGES}*.npy"))}
     return summary, Recording(columns, images)
 
 
@@ -240,7 +214,7 @@ class _Store:
         self._columns: dict[str, npt.NDArray[np.float32]] = {}
         for key, feature in keys.items():
             shape = (frames, *feature["shape"])
-            if key.startswith(IMAGE_PREFIX):
+            if key.startswith(IMAGES):
                 self._images[key] = new_frames(folder / f"{key}.npy", shape)
             else:
                 self._columns[key] = np.zeros(shape, np.float32)

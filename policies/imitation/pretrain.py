@@ -1,8 +1,8 @@
 """Behaviour cloning, with rounds of DAgger: trains the `hvs` policy on a recorded dataset.
 
-The loss is that of `HvsPolicy.forward`: the expert's joint step on a logarithmic scale, and the
-projected target as seen by each camera. A run is a function of dataset, seed and number of steps;
-if it was killed, the same command continues from the last checkpoint.
+What is learned in a step, `hvs_suite.policies.imitation.teacher` says. A run is a function of
+dataset, seed and number of steps; if it was killed, the same command continues from the last
+checkpoint.
 """
 
 import dataclasses
@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -29,18 +29,13 @@ from hvs_suite.policies.imitation.settings import (
     take_eyes,
 )
 from hvs_suite.policies.imitation.state import Counters, load_state, save_state
-from hvs_suite.policies.imitation.teacher import FrameTeacher, Teacher
-from hvs_suite.policies.imitation.window_teacher import WindowTeacher, set_prior
-from hvs_suite.policies.network.dataset import Manifest, read_manifest, refuse_test_split
+from hvs_suite.policies.imitation.teacher import Teacher, set_prior
 from hvs_suite.policies.training.budget import Budget
 from hvs_suite.policies.training.curves import Curves
+from hvs_suite.policies.training.dataset import Manifest, read_manifest, refuse_test_split
 from hvs_suite.policies.training.plot import draw_run
 from hvs_suite.policies.training.process import prepare_process
 from hvs_suite.policies.training.run_folder import claimed, write_train_config
-
-if TYPE_CHECKING:
-    from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
-    from hvs_suite.policies.hvs_belief.modeling_hvs_belief import HvsBeliefPolicy
 
 PACKAGES = ("hvs-suite", "lerobot", "numpy", "torch")
 WARMUP_SHARE = 0.03
@@ -169,8 +164,9 @@ def pretrain(
         )
         run = _Run(out, on_progress)
         demonstrations = run.decode(manifest, training / "cache", chosen)
+        set_prior(policy, demonstrations)
         run.train(
-            _teacher(policy, demonstrations, chosen, training),
+            Teacher(policy, demonstrations, chosen, training),
             chosen,
             budget=budget,
             rounds=_Rounds(
@@ -179,19 +175,6 @@ def pretrain(
             checkpoint_period_s=checkpoint_period_s,
         )
         return run.finish(policy)
-
-
-def _teacher(
-    policy: "HvsPolicy | HvsBeliefPolicy",
-    demonstrations: Demonstrations,
-    settings: Settings,
-    folder: Path,
-) -> Teacher:
-    """The teacher of a new policy."""
-    if settings.policy == "hvs":
-        return FrameTeacher(policy, demonstrations, settings)
-    set_prior(policy, demonstrations)
-    return WindowTeacher(policy, demonstrations, settings, folder)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -232,7 +215,6 @@ class _Run:
             cache,
             settings.seed,
             episodes=settings.episodes,
-            with_memory=settings.policy == "hvs",
             on_frames=self._meter("decoding", total),
         )
         self._decode_s = time.perf_counter() - started

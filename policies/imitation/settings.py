@@ -9,29 +9,20 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
-from hvs_suite.datasets.features import ACTION_EXECUTED
+from hvs_suite.datasets.features import IMAGES, STATE
 from hvs_suite.datasets.metadata import EXPERT
 from hvs_suite.errors import DatasetError, OptionError, PolicyError
 from hvs_suite.policies.belief.cell_model import cell_model
+from hvs_suite.policies.belief.eye import Eye
 from hvs_suite.policies.belief.settings import as_numbers, further_keys
-from hvs_suite.policies.checkpoints.files import read_config
-from hvs_suite.policies.checkpoints.loading import (
-    load_belief_network,
-    load_network,
-    weights_digest,
-)
+from hvs_suite.policies.checkpoints.loading import load_network, weights_digest
 from hvs_suite.policies.imitation.frame_cache import fingerprint
-from hvs_suite.policies.network.dataset import Manifest, calibration_of
-from hvs_suite.policies.network.network import IMAGE_PREFIX, STATE
 from hvs_suite.policies.trained_for import trained_for
+from hvs_suite.policies.training.dataset import Manifest
 from hvs_suite.registry import find
 
 if TYPE_CHECKING:
     from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
-    from hvs_suite.policies.hvs_belief.modeling_hvs_belief import HvsBeliefPolicy
-
-
-POLICIES = ("hvs", "hvs_belief")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -47,16 +38,11 @@ class Settings:
         dagger_frames: Frames a round.
         dataset: Fingerprint of the dataset.
         task: Named task that it was recorded on.
-        inputs: What the policy is given, of ``eih``, ``eth`` and ``joints``; None for all.
+        inputs: Cameras that the policy is given, of ``eih`` and ``eth``; None for all.
         episodes: Learn from the first so many demonstrations alone; None from all.
-        rehearsal_frames: Frames a step that the head alone learns from, without their images; see
-            `hvs_suite.policies.network.rehearsal`.
-        keypoint_weight: Weight of the supervision by ``privileged.*``; 0 trains on actions alone.
         error_scale: See `HvsConfig`.
         eyes: SHA-256 of the weights whose eyes it begins with; None for fresh ones.
-        policy: Type of the policy: ``hvs`` or ``hvs_belief``.
-        windows: Windows of control steps that belief and head of ``hvs_belief`` learn from in a
-            step.
+        windows: Windows of control steps a step that belief and head learn from.
         window_steps: Length of each.
     """
 
@@ -69,11 +55,8 @@ class Settings:
     task: str
     inputs: tuple[str, ...] | None = None
     episodes: int | None = None
-    rehearsal_frames: int = 512
-    keypoint_weight: float = 1.0
     error_scale: float
     eyes: str | None = None
-    policy: str = "hvs"
     windows: int = 48
     window_steps: int = 16
 
@@ -86,21 +69,13 @@ class Settings:
         Raises:
             OptionError: There is one.
         """
-        if self.policy not in POLICIES:
-            raise OptionError(f"policy is {self.policy!r}; choose from {', '.join(POLICIES)}")
-        if self.policy == "hvs_belief":
-            # What only the other one knows.
-            for name in ("rehearsal_frames", "keypoint_weight"):
-                if getattr(self, name) != getattr(type(self), name):
-                    raise OptionError(f"{name} is of policy hvs, not of hvs_belief; leave it out")
         for name in ("batch_size", "dagger_frames", "windows", "window_steps"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not 0.0 < self.learning_rate < 1.0:
             raise OptionError(f"learning_rate must be between 0 and 1, not {self.learning_rate}")
-        for name in ("dagger_rounds", "rehearsal_frames"):
-            if getattr(self, name) < 0:
-                raise OptionError(f"{name} must be 0 or more, not {getattr(self, name)}")
+        if self.dagger_rounds < 0:
+            raise OptionError(f"dagger_rounds must be 0 or more, not {self.dagger_rounds}")
         if self.dagger_rounds and manifest.demonstrator != EXPERT:
             raise OptionError(
                 f"{manifest.root} was recorded with {manifest.demonstrator}, and the expert labels "
@@ -110,8 +85,6 @@ class Settings:
             raise OptionError(
                 f"episodes must be 1 to the dataset's {manifest.n_episodes}, not {self.episodes}"
             )
-        if not 0.0 <= self.keypoint_weight < math.inf:
-            raise OptionError(f"keypoint_weight must be 0 or more, not {self.keypoint_weight}")
         if not 0.0 < self.error_scale < math.inf:
             raise OptionError(f"error_scale must be above 0, not {self.error_scale}")
 
@@ -142,18 +115,8 @@ def settings_for(manifest: Manifest, eyes: Path | None, chosen: Mapping[str, Any
     return settings
 
 
-def trails_its_set_point(manifest: Manifest) -> bool:
-    """Whether the arm goes on for steps after it was told to stop, and the dataset says where to.
-
-    Args:
-        manifest: Of the dataset.
-    """
-    task = find(manifest.task).with_options(manifest.options)
-    return task.latency_steps > 0 and ACTION_EXECUTED in manifest.features
-
-
-def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy | HvsBeliefPolicy":
-    """A fresh policy for a dataset's inputs; an `hvs` one calibrated from what it is to learn from.
+def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":
+    """A fresh policy for a dataset's inputs, its belief without a prior.
 
     Args:
         manifest: Of the dataset, with the inputs that the policy is to have.
@@ -162,81 +125,52 @@ def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy | HvsBelief
     Raises:
         DatasetError: The policy needs inputs that the dataset does not have.
     """
+    from lerobot.configs import FeatureType, PolicyFeature
+
+    from hvs_suite.policies.hvs.configuration_hvs import HvsConfig
+    from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
+
+    task = find(manifest.task).with_options(manifest.options)
+    config = HvsConfig(
+        input_features=_inputs(manifest),
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},
+        device="cpu",
+        push_to_hub=False,
+        optimizer_lr=settings.learning_rate,
+        error_scale=settings.error_scale,
+        cell=as_numbers(cell_model(task)),
+        window=settings.window_steps,
+        **trained_for(task).model_dump(),
+    )
     # torch initialises weights from its global generator; leave that as it was found.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(settings.seed)
-        make = _new_hvs if settings.policy == "hvs" else _new_hvs_belief
-        policy = make(manifest, settings)
-    for module in policy.network.eyes.values():
-        eye: Any = module  # of either kind
+        try:
+            policy = HvsPolicy(config)
+        except ValueError as error:
+            raise DatasetError(f"{manifest.root} does not do for hvs: {error}") from error
+    for eye in policy.network.eyes.values():
+        assert isinstance(eye, Eye)
         eye.train_in_bfloat16 = torch.cpu._is_avx512_bf16_supported()
     return policy
 
 
-def _new_hvs(manifest: Manifest, settings: Settings) -> "HvsPolicy":
-    from hvs_suite.policies.hvs.configuration_hvs import HvsConfig
-    from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
-
-    inputs = _inputs(manifest, [STATE])
-    config = HvsConfig(
-        **_common(manifest, settings, inputs),
-        keypoint_weight=settings.keypoint_weight,
-        from_set_point=STATE in inputs and trails_its_set_point(manifest),
-    )
-    policy = HvsPolicy(config)
-    if STATE in manifest.features:
-        policy.network.set_calibration(calibration_of(manifest.root, settings.episodes))
-    return policy
-
-
-def _new_hvs_belief(manifest: Manifest, settings: Settings) -> "HvsBeliefPolicy":
-    from hvs_suite.policies.hvs_belief.configuration_hvs_belief import HvsBeliefConfig
-    from hvs_suite.policies.hvs_belief.modeling_hvs_belief import HvsBeliefPolicy
-
-    vectors = [key for key in further_keys(manifest.features) if key is not None]
-    task = find(manifest.task).with_options(manifest.options)
-    config = HvsBeliefConfig(
-        **_common(manifest, settings, _inputs(manifest, [STATE, *vectors])),
-        cell=as_numbers(cell_model(task)),
-        window=settings.window_steps,
-    )
-    try:
-        return HvsBeliefPolicy(config)
-    except ValueError as error:
-        raise DatasetError(f"{manifest.root} does not do for hvs_belief: {error}") from error
-
-
-def _inputs(manifest: Manifest, vectors: list[str]) -> dict[str, Any]:
+def _inputs(manifest: Manifest) -> dict[str, Any]:
     """What a policy is given of a dataset, in LeRobot's words."""
     from lerobot.configs import FeatureType, PolicyFeature
 
     inputs = {
-        IMAGE_PREFIX + name: PolicyFeature(FeatureType.VISUAL, (shape[2], shape[0], shape[1]))
+        IMAGES + name: PolicyFeature(FeatureType.VISUAL, (shape[2], shape[0], shape[1]))
         for name, shape in manifest.cameras.items()
     }
-    for key in vectors:
+    for key in (STATE, *further_keys(manifest.features)):
         if key in manifest.features:
             kind = FeatureType.STATE if key == STATE else FeatureType.ENV
             inputs[key] = PolicyFeature(kind, tuple(manifest.features[key]["shape"]))
     return inputs
 
 
-def _common(manifest: Manifest, settings: Settings, inputs: dict[str, Any]) -> dict[str, Any]:
-    """What the configurations of both policies say."""
-    from lerobot.configs import FeatureType, PolicyFeature
-
-    return {
-        "input_features": inputs,
-        "output_features": {"action": PolicyFeature(FeatureType.ACTION, (7,))},
-        "device": "cpu",
-        "push_to_hub": False,
-        "optimizer_lr": settings.learning_rate,
-        "error_scale": settings.error_scale,
-        **trained_for(find(manifest.task).with_options(manifest.options)).model_dump(),
-    }
-
-
-def take_eyes(policy: "HvsPolicy | HvsBeliefPolicy", folder: Path) -> None:
+def take_eyes(policy: "HvsPolicy", folder: Path) -> None:
     """Begin with the eyes of another policy, for each camera whose layers are alike.
 
     Eyes that found larger targets find smaller ones soon; fresh ones may never get to see a target
@@ -244,17 +178,12 @@ def take_eyes(policy: "HvsPolicy | HvsBeliefPolicy", folder: Path) -> None:
 
     Args:
         policy: Whose eyes to replace.
-        folder: Checkpoint of a policy of the same type.
+        folder: Checkpoint of an `hvs` policy.
 
     Raises:
         PolicyError: It is none, or no camera has the same layers in both.
     """
-    config = read_config(folder)
-    kind = policy.config.type
-    if config.get("type") != kind:
-        raise PolicyError(f"{folder} holds a policy of type {config.get('type')}, not {kind}")
-    loaded = load_network(folder, config) if kind == "hvs" else load_belief_network(folder)
-    others, eyes = loaded.eyes, policy.network.eyes
+    others, eyes = load_network(folder).eyes, policy.network.eyes
     alike = [name for name in eyes if name in others and _fits(eyes[name], others[name])]
     if not alike:
         raise PolicyError(

@@ -10,7 +10,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from hvs_suite.datasets.features import ACTION
+from hvs_suite.datasets.features import ACTION, STATE
 from hvs_suite.files import replacing
 from hvs_suite.policies.belief.eye import (
     LOG_DIAMETER,
@@ -23,12 +23,13 @@ from hvs_suite.policies.belief.eye import (
 from hvs_suite.policies.belief.lessons import Window, remembered
 from hvs_suite.policies.belief.network import BeliefNetwork
 from hvs_suite.policies.belief.recorded import Recorded, recorded
-from hvs_suite.policies.imitation.demonstrations import FramePool
-from hvs_suite.policies.network.network import MEMORY, STATE
+from hvs_suite.policies.imitation.demonstrations import Demonstrations
 
 JITTER = 0.35
 """Eyes err more on pictures that they did not learn from: by so many of their own standard
 deviations, as much in a whole window alike as from frame to frame."""
+MEMORY = "memory"
+"""Key of what was remembered before each frame, in the file that `WindowPool.keep` writes."""
 BATCH = 256
 EPISODES_AT_ONCE = 256
 
@@ -36,16 +37,18 @@ Rows = npt.NDArray[np.int64]
 
 
 class WindowPool:
-    """Draws windows from a pool of frames.
+    """Draws windows from demonstrations.
 
     Args:
-        pool: The frames.
+        demonstrations: The frames.
         goal_key: Column that says which target is meant; None without.
         wrench_key: Column of the wrench; None without.
     """
 
-    def __init__(self, pool: FramePool, goal_key: str | None, wrench_key: str | None) -> None:
-        self._pool = pool
+    def __init__(
+        self, demonstrations: Demonstrations, goal_key: str | None, wrench_key: str | None
+    ) -> None:
+        self._demonstrations = demonstrations
         self._goal_key, self._wrench_key = goal_key, wrench_key
         self._sightings: dict[str, Tensor] = {}
         self._memory: Tensor | None = None
@@ -64,9 +67,9 @@ class WindowPool:
         """
         seen: dict[str, list[Tensor]] = {name: [] for name in network.shape.cameras}
         with torch.no_grad():
-            for first in range(0, len(self._pool), BATCH):
-                rows = np.arange(first, min(first + BATCH, len(self._pool)))
-                batch = self._pool.batch(rows)
+            for first in range(0, len(self._demonstrations), BATCH):
+                rows = np.arange(first, min(first + BATCH, len(self._demonstrations)))
+                batch = self._demonstrations.batch(rows)
                 for name, sighting in network.look(*self.pictures(network, batch)).items():
                     seen[name].append(sighting)
         self._sightings = {name: torch.cat(parts) for name, parts in seen.items()}
@@ -83,13 +86,13 @@ class WindowPool:
 
     def _open(self, network: BeliefNetwork) -> None:
         """Take the columns of all frames into memory."""
-        columns = self._pool.columns()
+        columns = self._demonstrations.columns()
         self._truth: Recorded = recorded(
             columns, tuple(network.shape.cameras), network.cell.period_s
         )
         keys = [STATE, ACTION] + ([self._wrench_key] if self._wrench_key else [])
         self._columns = {key: torch.from_numpy(columns[key]) for key in keys}
-        self._begins, self._lengths = self._pool.episodes()
+        self._begins, self._lengths = self._demonstrations.episodes()
 
     def recall(self, network: BeliefNetwork) -> None:
         """Have the belief go through every episode again, from what the eyes saw last.
@@ -204,7 +207,7 @@ class WindowPool:
                 share = float(file.metadata()["share"])
         except (SafetensorError, OSError, LookupError, TypeError, ValueError):
             return None
-        if any(len(sighting) != len(self._pool) for sighting in seen.values()):
+        if any(len(sighting) != len(self._demonstrations) for sighting in seen.values()):
             return None
         self._sightings, self._memory = seen, memory
         self._open(network)

@@ -1,4 +1,4 @@
-"""A policy with a residual as an ordinary `hvs_belief` checkpoint."""
+"""A policy with a residual as an ordinary `hvs` checkpoint."""
 
 import dataclasses
 import json
@@ -15,7 +15,7 @@ from hvs_suite.policies.checkpoints.files import CONFIG, WEIGHTS, read_config
 from hvs_suite.policies.checkpoints.loading import (
     NETWORK_PREFIX,
     STANDARD_STEPS,
-    load_belief_network,
+    load_network,
 )
 from hvs_suite.policies.residual.settings import Settings
 from hvs_suite.policies.trained_for import trained_for
@@ -29,12 +29,9 @@ def load_base(folder: Path) -> BeliefNetwork:
         folder: The checkpoint.
 
     Raises:
-        PolicyError: It is not of an `hvs_belief` policy, or was fine-tuned already.
+        PolicyError: It is not of an `hvs` policy, or was fine-tuned already.
     """
-    config = read_config(folder)
-    if config["type"] != "hvs_belief":
-        raise PolicyError(f"{folder} holds a policy of type {config['type']}, not hvs_belief")
-    network = load_belief_network(folder)
+    network = load_network(folder)
     if network.residual is not None:
         raise PolicyError(f"{folder} was fine-tuned already; go on from the policy before that")
     return network

@@ -26,7 +26,7 @@ from hvs_suite.policies.belief.acting import CompiledParts
 from hvs_suite.policies.belief.network import FELT
 from hvs_suite.policies.belief.residual import FINE_M, N_LENGTHS, SHIFT
 from hvs_suite.policies.checkpoints.files import read_config
-from hvs_suite.policies.checkpoints.loading import belief_inputs
+from hvs_suite.policies.checkpoints.loading import network_inputs
 from hvs_suite.policies.residual.folding import load_base, with_residual
 from hvs_suite.policies.residual.settings import Settings
 from hvs_suite.registry import find, load
@@ -193,7 +193,7 @@ class Stage(gymnasium.Env[Any, Any]):
         return bool(time_step.last())
 
     def _look(self, observation: Mapping[str, npt.NDArray[Any]]) -> None:
-        self._inputs = inputs = belief_inputs(self._network, self._config, observation)
+        self._inputs = inputs = network_inputs(self._network, self._config, observation)
         with one_torch_thread(), torch.inference_mode():
             self._memory, self._sightings, self._read = self._parts.perceive(
                 inputs.images, inputs.state, self._memory, inputs.goal, inputs.felt

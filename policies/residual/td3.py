@@ -1,4 +1,4 @@
-"""RL fine-tuning of an `hvs_belief` policy: TD3 on a residual that moves its goal, top to bottom.
+"""RL fine-tuning of an `hvs` policy: TD3 on a residual that moves its goal, top to bottom.
 
 Fujimoto, van Hoof and Meger, 2018 (https://arxiv.org/abs/1802.09477), in the manner of CleanRL. It
 starts exactly as the policy that it is given: the critics learn alone at first, a penalty holds the
@@ -78,9 +78,9 @@ def finetune(
     """Fine-tune an imitated policy, or go on with a run that was interrupted.
 
     Args:
-        policy: Checkpoint of an `hvs_belief` policy.
+        policy: Checkpoint of an `hvs` policy.
         task: Named task.
-        out: Folder for the checkpoint, an `hvs_belief` policy like the base; the training state
+        out: Folder for the checkpoint, an `hvs` policy like the base; the training state
             lives in ``out/training``.
         minutes: Stop after this much playing and learning, evaluations not counted (min).
         steps: Stop after this many environment steps. Give either, or both for the first reached.

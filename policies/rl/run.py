@@ -14,21 +14,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
+from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 
 from hvs_suite.files import replacing
 from hvs_suite.policies.rl.curves import LoggedCurves
-from hvs_suite.policies.rl.evaluation import (
-    Evaluator,
-    fallen,
-    read_evaluations,
-    standing,
-    write_evaluations,
-)
+from hvs_suite.policies.rl.evaluation import Evaluator, read_evaluations, write_evaluations
 from hvs_suite.policies.rl.journal import OUTCOMES
 from hvs_suite.policies.rl.outcome import Outcome, Progress
 from hvs_suite.policies.rl.plot import draw_rl_run
-from hvs_suite.policies.rl.state import Counters, Model, load_run, save_run
+from hvs_suite.policies.rl.state import Counters, load_run, save_run
 from hvs_suite.policies.training.budget import Budget
 from hvs_suite.policies.training.curves import Curves
 from hvs_suite.rollout import Policy
@@ -40,18 +35,11 @@ RECENT = 100
 
 
 class Learner(Protocol):
-    """What the algorithms differ in.
-
-    Attributes:
-        guards_success: What plays is what was evaluated best so far, see `standing`, not what was
-            last; and the run ends where success has fallen.
-    """
-
-    guards_success: bool
+    """What learns, and the policy that comes of it."""
 
     @property
-    def model(self) -> Model:
-        """SB3's, its environments journals."""
+    def model(self) -> SAC:
+        """SB3's, its environment a journal."""
 
     def policy(self) -> Policy:
         """What the model has learnt so far, without exploration."""
@@ -99,7 +87,7 @@ class Run:
     def train(
         self, budget: Budget, collect_steps: int, eval_every: int, checkpoint_period_s: float
     ) -> None:
-        """Train until the budget is used up, or success has fallen.
+        """Train until the budget is used up.
 
         Args:
             budget: How long.
@@ -115,7 +103,7 @@ class Run:
             self._checkpoint()
         last_checkpoint = time.perf_counter()
         iterations = 0
-        while share < 1.0 and not self._has_fallen():
+        while share < 1.0:
             started = time.perf_counter()
             # One iteration: SB3 collects `collect_steps` steps, then updates.
             model.learn(collect_steps, log_interval=sys.maxsize, reset_num_timesteps=False)
@@ -148,14 +136,11 @@ class Run:
             env_steps_per_s=env_steps / max(1e-9, self._counters.elapsed_s),
             n_parameters=sum(p.numel() for p in self._model.actor.parameters()),
             evaluation=self._evaluations[-1] if self._evaluations else None,
-            has_fallen=self._has_fallen(),
+            has_fallen=False,
         )
 
-    def _has_fallen(self) -> bool:
-        return self._learner.guards_success and fallen(self._evaluations)
-
     def _evaluate(self) -> None:
-        """Play greedily, film scene 0, keep the figures, and the policy if it is to be kept."""
+        """Play greedily, film scene 0, keep the figures and the policy."""
         env_steps = self._model.num_timesteps
         evaluation = self._evaluator.evaluate(
             self._learner.policy(),
@@ -167,9 +152,7 @@ class Run:
         self._evaluations.append(evaluation)
         write_evaluations(self._training / "evaluations.json", self._evaluations)
         self._curves.add({f"eval/{k}": v for k, v in evaluation.figures().items()}, env_steps)
-        best = max(standing(each) for each in self._evaluations)
-        if not self._learner.guards_success or standing(evaluation) == best:
-            self._learner.keep()
+        self._learner.keep()
 
     def _checkpoint(self) -> None:
         save_run(self._training, self._model, self._counters)

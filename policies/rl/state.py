@@ -16,7 +16,7 @@ import numpy.typing as npt
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
-from stable_baselines3 import SAC, TD3
+from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import DictReplayBuffer
 from torch import Tensor
 
@@ -26,8 +26,6 @@ from hvs_suite.files import replacing
 STATE = "state.safetensors"
 REPLAY = "replay"
 Rows = dict[str, npt.NDArray[Any]]
-Model = SAC | TD3
-"""Learns in one or several environments, each a `Journal`."""
 
 
 @dataclasses.dataclass
@@ -36,24 +34,23 @@ class Counters:
 
     Attributes:
         elapsed_s: Time spent playing and learning over all sittings (s).
-        stored: Rows that went into the replay memory, forgotten ones included; a row holds one
-            transition of each environment.
+        stored: Transitions that went into the replay memory, forgotten ones included.
     """
 
     elapsed_s: float = 0.0
     stored: int = 0
 
 
-def save_run(folder: Path, model: Model, counters: Counters) -> None:
+def save_run(folder: Path, model: SAC, counters: Counters) -> None:
     """Write the state of a run; call it between two iterations.
 
     Args:
         folder: Where the state lives.
-        model: Networks, optimisers, replay memory, counters and environments.
+        model: Networks, optimisers, replay memory, counters and a `Journal` as its environment.
         counters: Gets the rows that are now stored.
     """
     assert model.env is not None
-    stored = model.num_timesteps // model.n_envs
+    stored = model.num_timesteps
     _save_rows(folder / REPLAY, _memory(model), counters.stored, stored)
     counters.stored = stored
     rng = np.random.get_state()  # noqa: NPY002 - SB3 draws batches from this generator
@@ -64,7 +61,7 @@ def save_run(folder: Path, model: Model, counters: Counters) -> None:
         "env_steps": model.num_timesteps,
         "updates": model._n_updates,
         "episodes": model._episode_num,
-        "places": model.env.env_method("state_dict"),
+        "place": model.env.env_method("state_dict")[0],
         "recent": list(model.ep_info_buffer or ()),
         "recent_success": list(model.ep_success_buffer or ()),
         "numpy_rng": [rng[0], rng[1].tolist(), *rng[2:]],
@@ -76,13 +73,13 @@ def save_run(folder: Path, model: Model, counters: Counters) -> None:
     _forget_rows(folder / REPLAY, stored, _memory(model).buffer_size)
 
 
-def load_run(folder: Path, model: Model) -> Counters:
+def load_run(folder: Path, model: SAC) -> Counters:
     """Put a run back to where it was saved; a folder without a state is a run not begun.
 
     Args:
         folder: As given to `save_run`.
-        model: Of the same settings, fresh; the next reset of its environments leads into the
-            middle of their episodes.
+        model: Of the same settings, fresh; the next reset of its environment leads into the
+            middle of an episode.
 
     Returns:
         How far the run had come.
@@ -105,8 +102,7 @@ def load_run(folder: Path, model: Model) -> Counters:
         model.ep_info_buffer = deque(header["recent"], maxlen=window)
         model.ep_success_buffer = deque(header["recent_success"], maxlen=window)
         assert model.env is not None
-        for part, state in enumerate(header["places"]):
-            model.env.env_method("load_state_dict", state, indices=part)
+        model.env.env_method("load_state_dict", header["place"])
         name, key, *rest = header["numpy_rng"]
         np.random.set_state((name, np.array(key, np.uint32), *rest))  # noqa: NPY002
         torch.set_rng_state(tensors["torch_rng"])
@@ -119,31 +115,31 @@ def load_run(folder: Path, model: Model) -> Counters:
     return counters
 
 
-def _memory(model: Model) -> DictReplayBuffer:
+def _memory(model: SAC) -> DictReplayBuffer:
     assert isinstance(model.replay_buffer, DictReplayBuffer)
     return model.replay_buffer
 
 
-def _optimizers(model: Model) -> dict[str, torch.optim.Optimizer]:
+def _optimizers(model: SAC) -> dict[str, torch.optim.Optimizer]:
     found = {"actor": model.actor.optimizer, "critic": model.critic.optimizer}
-    if isinstance(model, SAC) and model.ent_coef_optimizer is not None:
+    if model.ent_coef_optimizer is not None:
         found["temperature"] = model.ent_coef_optimizer
     return found
 
 
-def _tensors(model: Model) -> dict[str, Tensor]:
+def _tensors(model: SAC) -> dict[str, Tensor]:
     """Networks, optimiser moments, temperature and torch's random state, by name."""
     tensors = {f"policy/{name}": value for name, value in model.policy.state_dict().items()}
     for which, optimizer in _optimizers(model).items():
         for index, moments in optimizer.state_dict()["state"].items():
             for name, value in moments.items():
                 tensors[f"{which}/{index}/{name}"] = value
-    if isinstance(model, SAC) and model.log_ent_coef is not None:
+    if model.log_ent_coef is not None:
         tensors["log_ent_coef"] = model.log_ent_coef
     return {**tensors, "torch_rng": torch.get_rng_state()}
 
 
-def _put_tensors(model: Model, tensors: dict[str, Tensor]) -> None:
+def _put_tensors(model: SAC, tensors: dict[str, Tensor]) -> None:
     prefix = "policy/"
     model.policy.load_state_dict(
         {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
@@ -156,7 +152,7 @@ def _put_tensors(model: Model, tensors: dict[str, Tensor]) -> None:
                 moments.setdefault(int(index), {})[name] = value
         groups = optimizer.state_dict()["param_groups"]
         optimizer.load_state_dict({"state": moments, "param_groups": groups})
-    if isinstance(model, SAC) and model.log_ent_coef is not None:
+    if model.log_ent_coef is not None:
         with torch.no_grad():
             model.log_ent_coef.copy_(tensors["log_ent_coef"])
 

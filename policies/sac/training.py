@@ -118,8 +118,6 @@ def train_sac(
 class _Sac:
     """SAC as `Run` takes it."""
 
-    guards_success = False
-
     def __init__(self, out: Path, model: SAC) -> None:
         self.model = model
         self._out = out

@@ -19,8 +19,8 @@ PARTS = {
     "action_loss": "action",
     "eih_loss": "eye in hand",
     "eth_loss": "eye to hand",
-    "target_loss": "place of the target",
-    "flange_loss": "where the flange goes",
+    "tip_loss": "where the tip goes",
+    "belief_place_loss": "place of the target",
 }
 Curve = tuple[Any, Any]
 

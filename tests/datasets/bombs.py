@@ -27,7 +27,7 @@ from hvs_suite.datasets.check import check_dataset
 from hvs_suite.datasets.replay import read_recorded
 from hvs_suite.errors import HvsError
 from hvs_suite.policies.imitation.demonstrations import Demonstrations
-from hvs_suite.policies.network.dataset import read_manifest
+from hvs_suite.policies.training.dataset import read_manifest
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "align-thesis"
 # Should a bound not hold, the child falls, and not the machine.

@@ -69,7 +69,7 @@ def test_replay_reads_it_whole_or_not_at_all(damaged):
 
 def test_training_reads_it_whole_or_not_at_all(damaged, tmp_path):
     from hvs_suite.policies.imitation.demonstrations import Demonstrations
-    from hvs_suite.policies.network.dataset import read_manifest
+    from hvs_suite.policies.training.dataset import read_manifest
 
     def read():
         return Demonstrations(read_manifest(damaged), tmp_path / "cache", seed=0)

@@ -134,10 +134,10 @@ def test_act_trains_for_a_few_steps_and_is_scored(tmp_path):
 
 
 def test_our_policy_trains_on_windows_resumes_and_is_played_without_lerobot(tmp_path):
-    discover = "--policy.discover_packages_path=hvs_suite.policies.hvs_belief"
+    discover = "--policy.discover_packages_path=hvs_suite.policies.hvs"
     out = tmp_path / "belief"
     done = call(
-        tmp_path, "lerobot-train", discover, "--policy.type=hvs_belief",
+        tmp_path, "lerobot-train", discover, "--policy.type=hvs",
         "--dataset.repo_id=local/sample", f"--dataset.root={SAMPLE}", "--policy.device=cpu",
         "--policy.push_to_hub=false", "--policy.window=3", "--policy.channels=8",
         "--policy.hidden=32", "--num_workers=0", "--batch_size=2", "--steps=2", "--log_freq=1",

@@ -85,7 +85,7 @@ def test_where_the_far_camera_may_be_off_the_hand_looks_before_it_comes_down(tas
 
 @pytest.mark.parametrize("task", ["align-hard", "align-limit"])
 def test_from_a_random_start_the_way_is_the_one_that_the_policy_takes_to_be_the_nearer(task):
-    from hvs_suite.policies.network.geometry import way_to_posture
+    from hvs_suite.policies.belief.arm import way_to_posture
 
     both = 0
     with hvs_suite.load(task, split="train", observations="state") as env:
@@ -94,7 +94,11 @@ def test_from_a_random_start_the_way_is_the_one_that_the_policy_takes_to_be_the_
             env.reset(scenario=scenario)
             truth = env.privileged()
             q, goal = truth["joint_positions"], truth["goal_position"]
-            turns, time_s, within = way_to_posture(torch.tensor(q[None]), torch.tensor(goal[None]))
+            turns, time_s, within = way_to_posture(
+                torch.tensor(q[None]),
+                torch.tensor(goal[None]),
+                torch.tensor([[0.0, 0.0, 1.0]]).double(),
+            )
             planner = demonstrator._planner
             planner._remember_goal(env.goal())
             family = planner._reachable(q, np.zeros(7), env.goal())

@@ -108,7 +108,7 @@ def flattered(folder: Path, forged: Collection[int]) -> Path:
     path = folder / "results" / "mine" / "align-easy.json"
     path.parent.mkdir(parents=True)
     for name in ("align-easy.json", "align-easy.actions.npz"):
-        shutil.copy(RESULTS / "finetuned" / name, path.with_name(name))
+        shutil.copy(RESULTS / "pretrained" / name, path.with_name(name))
     rewrite(path, lambda r: with_errors(r, 1.0) if r.scenario in forged else r)
     return path
 

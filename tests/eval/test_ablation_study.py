@@ -14,7 +14,7 @@ BUDGET = Budget(steps=2, dagger_rounds=1, dagger_frames=8, seed=0, episodes=2, w
 
 
 def test_rows_lack_what_they_say_and_are_not_made_twice(tmp_path):
-    names = ["no joints", "no DAgger, 1/4 of the data"]
+    names = ["no eye in hand", "no DAgger, 1/4 of the data"]
     reports: list[str] = []
     study = run_study(SAMPLE, tmp_path, names, BUDGET, lambda *words: reports.append(words[0]))
     assert [row.name for row in study.rows] == [WHOLE, NO_DAGGER, *names]
@@ -24,7 +24,7 @@ def test_rows_lack_what_they_say_and_are_not_made_twice(tmp_path):
     settings = {
         path.parent.parent.name: json.loads(path.read_text())["settings"] for path in configs
     }
-    assert settings["no-joints"]["inputs"] == ["eih", "eth"]
+    assert settings["no-eye-in-hand"]["inputs"] == ["eth"]
     assert settings["no-dagger"]["dagger_rounds"] == 0
     assert settings["everything"]["dagger_rounds"] == 1
     again: list[str] = []

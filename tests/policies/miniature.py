@@ -108,6 +108,7 @@ def scene(n: int, side: int = 28, seed: int = 0) -> dict[str, npt.NDArray[Any]]:
     step = np.zeros((n, 7))
     step[:, :2] = 0.1 * columns["privileged.target_eih"][:, :2]
     columns["action"] = ((q + step) / JOINT_RANGE_RAD).astype(np.float32)
+    columns["privileged.action_executed"] = columns["action"]
     goal = np.concatenate([rng.uniform(-0.6, 0.6, (n, 2)), np.full((n, 1), 0.05)], axis=1)
     columns["privileged.goal_position"] = goal.astype(np.float32)
     columns["privileged.goal_normal"] = np.tile(np.float32([0, 0, 1]), (n, 1))

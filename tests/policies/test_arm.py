@@ -1,4 +1,4 @@
-"""Geometry of the second policy: postures, steps and how far down the tip may go."""
+"""Geometry of the arm: kinematics, postures, steps and how far down the tip may go."""
 
 import math
 
@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from hvs_suite.cell import robot
+from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.policies.belief import arm
-from hvs_suite.policies.network.geometry import flange_motion
+from hvs_suite.policies.belief.geometry import flange_motion
 
 UP = torch.tensor([[0.0, 0.0, 1.0]])
 NOWHERE = torch.tensor(-1.0)
@@ -24,6 +25,18 @@ def goals(n: int, *, tilt: float) -> tuple[Tensor, Tensor]:
     slope = tilt * torch.randn(n, 2, generator=generator)
     normal = torch.cat([slope, torch.ones(n, 1)], dim=1)
     return place, normal / normal.norm(dim=1, keepdim=True)
+
+
+def test_kinematics_agree_with_pinocchio() -> None:
+    q = np.random.default_rng(0).uniform(-2.0, 2.0, (20, 7))
+    motion = flange_motion(torch.from_numpy(q))
+    for i, configuration in enumerate(q):
+        rotation, position = kinematics().flange_pose(configuration)
+        np.testing.assert_allclose(motion.rotation[i], rotation, atol=1e-9)
+        np.testing.assert_allclose(motion.position[i], position, atol=1e-9)
+        np.testing.assert_allclose(
+            motion.jacobian[i], kinematics().jacobian(configuration), atol=1e-9
+        )
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.3])

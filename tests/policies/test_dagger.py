@@ -14,7 +14,7 @@ from hvs_suite.errors import OptionError
 from hvs_suite.policies.imitation.dagger import play_round, read_round, round_shares
 from hvs_suite.policies.imitation.demonstrations import Demonstrations
 from hvs_suite.policies.imitation.pretrain import pretrain
-from hvs_suite.policies.network.dataset import read_manifest
+from hvs_suite.policies.training.dataset import read_manifest
 
 SIDE = 28
 OPTIONS = {"eih_resolution": SIDE, "eth_resolution": SIDE}

@@ -16,7 +16,7 @@ from hvs_suite.policies.checkpoints.files import read_config
 from hvs_suite.policies.checkpoints.loading import load_network
 from hvs_suite.policies.imitation.demonstrations import Demonstrations
 from hvs_suite.policies.imitation.pretrain import pretrain
-from hvs_suite.policies.network.dataset import calibration_of, read_manifest
+from hvs_suite.policies.training.dataset import calibration_of, read_manifest
 
 
 def weights(folder: Path):

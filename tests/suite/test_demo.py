@@ -18,6 +18,7 @@ def demo(tmp_path_factory):
     """The demo's folder, after the smallest demo there is."""
     out = tmp_path_factory.mktemp("demo") / "runs"
     words = ["--episodes", EPISODES, "--minutes", 0.02, "--evaluations", EVALUATIONS]
+    words += ["--dagger-frames", 20]
     assert run(["demo", "--out", str(out), *map(str, words)]) == 0
     return out
 

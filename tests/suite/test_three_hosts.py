@@ -16,7 +16,6 @@ import pytest
 from hosts import Hosts, reason_against
 from safetensors.numpy import load_file
 
-from hvs_suite.cli.main import run
 from hvs_suite.datasets.recorder import record
 from hvs_suite.eval import protocol
 from hvs_suite.eval.scoring import progress_file, result_file
@@ -139,14 +138,4 @@ def test_dagger_ends_in_the_weights_of_one_process(hosts: Hosts, tmp_path: Path)
     words += ["--dagger-rounds", "1", "--dagger-frames", "60"]
     finish(command(hosts, words))
     pretrain(SAMPLE, tmp_path / "here", steps=4, dagger_rounds=1, dagger_frames=60, workers=1)
-    assert_same_weights(tmp_path / "here", tmp_path / "there")
-
-
-@pytest.mark.slow
-def test_fine_tuning_ends_in_the_weights_of_one_computer(hosts: Hosts, tmp_path: Path) -> None:
-    words = ["finetune", "--policy", "pretrained", "--task", TASK, "--steps", "80"]
-    words += ["--warm-up-steps", "40", "--eye-rounds", "1", "--eye-frames", "40"]
-    words += ["--eye-steps", "2", "--eval-episodes", "2", "--out"]
-    finish(command(hosts, [*words, str(tmp_path / "there")]))
-    assert run([*words, str(tmp_path / "here")]) == 0
     assert_same_weights(tmp_path / "here", tmp_path / "there")

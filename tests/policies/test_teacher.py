@@ -1,4 +1,4 @@
-"""Pretraining of a network with a belief: it learns, resumes to the same end, and can be played."""
+"""What eyes, belief and head learn from in turns, and that a run resumes in each of these turns."""
 
 import json
 import math
@@ -13,16 +13,15 @@ from safetensors.torch import load_file
 
 from hvs_suite.errors import DatasetError, OptionError
 from hvs_suite.policies.belief.network import SET_POINT
-from hvs_suite.policies.checkpoints.loading import CheckpointFactory, load_belief_network
+from hvs_suite.policies.checkpoints.loading import CheckpointFactory, load_network
 from hvs_suite.policies.imitation.demonstrations import Demonstrations
 from hvs_suite.policies.imitation.pretrain import pretrain
 from hvs_suite.policies.imitation.windows import WindowPool
-from hvs_suite.policies.network.dataset import read_manifest
+from hvs_suite.policies.training.dataset import read_manifest
 from hvs_suite.registry import load
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "align-thesis"
 SMALL = {
-    "policy": "hvs_belief",
     "batch_size": 8,
     "windows": 6,
     "window_steps": 6,
@@ -51,7 +50,7 @@ def test_a_run_learns_from_its_rounds_and_ends_in_a_checkpoint_that_plays(traine
     assert outcome["step"] == 12
     assert math.isfinite(outcome["held_out_loss"])
     assert [played["frames"] for played in outcome["rounds"]] == [24]
-    assert json.loads((trained / "config.json").read_text())["type"] == "hvs_belief"
+    assert json.loads((trained / "config.json").read_text())["type"] == "hvs"
     with load("align-thesis", split="dev") as env:
         policy = CheckpointFactory(str(trained))(env)
         seen = env.reset(scenario=0).observation
@@ -78,8 +77,8 @@ def test_a_killed_run_ends_like_one_that_was_left_alone(trained, tmp_path):
 
 
 def test_windows_hold_the_frames_of_one_episode_and_what_was_remembered(trained, tmp_path):
-    demonstrations = Demonstrations(read_manifest(SAMPLE), tmp_path / "cache", 0, with_memory=False)
-    network = load_belief_network(trained)
+    demonstrations = Demonstrations(read_manifest(SAMPLE), tmp_path / "cache", 0)
+    network = load_network(trained)
     pool = WindowPool(demonstrations, None, None)
     pool.look(network)
     begins, lengths = demonstrations.episodes()
@@ -102,8 +101,7 @@ def test_windows_hold_the_frames_of_one_episode_and_what_was_remembered(trained,
     ("options", "message"),
     [
         ({"windows": 0}, "windows must be at least 1"),
-        ({"keypoint_weight": 0.5}, "keypoint_weight is of policy hvs"),
-        ({"policy": "huge"}, "choose from hvs, hvs_belief"),
+        ({"window_steps": 0}, "window_steps must be at least 1"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(tmp_path, options, message):
@@ -113,6 +111,7 @@ def test_options_that_make_no_sense_are_refused(tmp_path, options, message):
 
 def test_a_dataset_that_does_not_say_what_is_true_is_refused(tmp_path):
     columns = miniature.scene(8, side=112)
+    del columns["privileged.goal_normal"]
     miniature.write_dataset(tmp_path / "data", columns, miniature.episodes(8))
     with pytest.raises(DatasetError, match="lacks privileged"):
         pretrain(tmp_path / "data", tmp_path / "out", steps=1, **SMALL)

@@ -1,4 +1,4 @@
-"""A recorded LeRobot dataset as the `hvs` policy reads it: description, columns, camera maps.
+"""A recorded LeRobot dataset as the `hvs` policy reads it: description and columns.
 
 Reads the dataset's own files (format v3, frames as images) without importing LeRobot's dataset
 package, which takes longer than opening a small dataset.
@@ -13,21 +13,23 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.datasets import reader
-from hvs_suite.datasets.features import ACTION, ACTION_EXECUTED, dataset_features
+from hvs_suite.datasets.features import (
+    ACTION,
+    ACTION_EXECUTED,
+    IMAGES,
+    OBSERVATION,
+    STATE,
+    dataset_features,
+)
 from hvs_suite.datasets.metadata import EXPERT, read_metadata
 from hvs_suite.errors import DatasetError, OptionError, UnknownTaskError
-from hvs_suite.policies.network.geometry import Calibration, calibrate
-from hvs_suite.policies.network.network import IMAGE_PREFIX, N_JOINTS, STATE
 from hvs_suite.registry import find
-from hvs_suite.tasks.shared.placing import PlacingSpec
 
 EPISODE = "episode_index"
 GOAL_POSITION = "privileged.goal_position"
 GOAL_NORMAL = "privileged.goal_normal"
 GOAL_VELOCITY = "privileged.goal_velocity"
-VECTOR_PREFIX = "observation."
 TARGET_PREFIX = "privileged.target_"
-JOINTS = "joints"
 
 Column = npt.NDArray[Any]
 
@@ -60,9 +62,9 @@ class Manifest:
     def cameras(self) -> dict[str, tuple[int, int, int]]:
         """Camera name to (H, W, C) of its frames."""
         return {
-            key.removeprefix(IMAGE_PREFIX): (shape[0], shape[1], shape[2])
+            key.removeprefix(IMAGES): (shape[0], shape[1], shape[2])
             for key, feature in sorted(self.features.items())
-            if key.startswith(IMAGE_PREFIX)
+            if key.startswith(IMAGES)
             for shape in [feature["shape"]]
         }
 
@@ -71,11 +73,11 @@ class Manifest:
         """The features that training reads: all observations, actions, targets, goal."""
         wanted = {STATE, ACTION, ACTION_EXECUTED, GOAL_POSITION, GOAL_NORMAL, GOAL_VELOCITY}
         wanted |= {TARGET_PREFIX + name for name in self.cameras}
-        wanted |= {IMAGE_PREFIX + name for name in self.cameras}
+        wanted |= {IMAGES + name for name in self.cameras}
         wanted |= {
             key
             for key in self.features
-            if key.startswith(VECTOR_PREFIX) and "." not in key.removeprefix(VECTOR_PREFIX)
+            if key.startswith(OBSERVATION) and "." not in key.removeprefix(OBSERVATION)
         }
         return [key for key in self.features if key in wanted]
 
@@ -83,17 +85,18 @@ class Manifest:
         """The same dataset for a policy that is given less.
 
         Args:
-            names: Of ``eih``, ``eth`` and ``joints``.
+            names: Cameras that are left, of ``eih`` and ``eth``.
 
         Raises:
-            OptionError: A name is unknown, or no camera is left.
+            OptionError: A name is unknown, or none is left.
         """
-        available = {**{name: IMAGE_PREFIX + name for name in self.cameras}, JOINTS: STATE}
-        if unknown := sorted(set(names) - set(available)):
-            raise OptionError(f"unknown input {unknown[0]!r}; choose from {', '.join(available)}")
-        if not set(names) & set(self.cameras):
+        if unknown := sorted(set(names) - set(self.cameras)):
+            raise OptionError(
+                f"unknown input {unknown[0]!r}; choose from {', '.join(self.cameras)}"
+            )
+        if not names:
             raise OptionError("no camera is left to see the target with; keep eih or eth")
-        dropped = {key for name, key in available.items() if name not in names}
+        dropped = {IMAGES + name for name in self.cameras if name not in names}
         features = {key: value for key, value in self.features.items() if key not in dropped}
         return dataclasses.replace(self, features=features)
 
@@ -132,7 +135,7 @@ def read_manifest(root: Path) -> Manifest:
     for key in manifest.trained_keys:
         found = list(manifest.features[key]["shape"])
         # Pictures may be smaller than the task's; their size is checked in the files.
-        if key.startswith(IMAGE_PREFIX):
+        if key.startswith(IMAGES):
             continue
         right = list(wanted[key]["shape"]) if key in wanted else "recorded on this task"
         if found != right:
@@ -174,7 +177,7 @@ def read_columns(manifest: Manifest, wanted: Collection[str] | None = None) -> d
     keys = [
         key
         for key in (manifest.trained_keys if wanted is None else wanted)
-        if not key.startswith(IMAGE_PREFIX)
+        if not key.startswith(IMAGES)
     ]
     if wanted is None and (ACTION not in keys or not manifest.cameras):
         raise DatasetError(f"{manifest.root} needs an action and at least one camera to learn from")
@@ -207,50 +210,3 @@ def read_columns(manifest: Manifest, wanted: Collection[str] | None = None) -> d
             f"{len(columns[EPISODE])}; record it again"
         )
     return columns
-
-
-def calibration_of(root: Path, episodes: int | None = None) -> Calibration:
-    """Fit the camera maps of the `hvs` network to a dataset's privileged columns.
-
-    Args:
-        root: The dataset.
-        episodes: Fit them to the first so many episodes alone; None to all.
-
-    Returns:
-        The calibration.
-
-    Raises:
-        DatasetError: The dataset lacks the columns.
-    """
-    manifest = read_manifest(root)
-    columns = read_columns(manifest)
-    missing = {STATE, GOAL_POSITION, GOAL_NORMAL} - set(columns)
-    if missing:
-        raise DatasetError(f"{root} lacks {', '.join(sorted(missing))}")
-    return calibrate_on(manifest, columns, episodes)
-
-
-def calibrate_on(
-    manifest: Manifest, columns: Mapping[str, Column], episodes: int | None
-) -> Calibration:
-    """As `calibration_of`, of columns that have been read."""
-    known = np.isin(columns[EPISODE], np.unique(columns[EPISODE])[:episodes])
-    double = {key: column[known].astype(np.float64) for key, column in columns.items()}
-    return calibrate(
-        q=double[STATE][:, :N_JOINTS],
-        goal_position=double[GOAL_POSITION],
-        goal_normal=double[GOAL_NORMAL],
-        standoff_m=_standoff(manifest),
-        target_eih=double.get(TARGET_PREFIX + "eih"),
-        target_eth=double.get(TARGET_PREFIX + "eth"),
-    )
-
-
-def _standoff(manifest: Manifest) -> float:
-    spec = find(manifest.task).with_options(manifest.options)
-    if not isinstance(spec, PlacingSpec):
-        raise DatasetError(
-            f"{manifest.root} was recorded on {manifest.task}; this policy knows targets on a "
-            "level surface alone"
-        )
-    return spec.standoff_m
