@@ -38,7 +38,6 @@ def draw_run(out: Path) -> Path:
         OutputError: It cannot be written.
     """
     from matplotlib.figure import Figure
-    from matplotlib.ticker import LogLocator
 
     curves = read_curves(out / "training" / "tensorboard")
     rounds = _rounds(out / "training" / "dagger")
@@ -49,10 +48,9 @@ def draw_run(out: Path) -> Path:
     whole.set_title("loss")
     parts.set_title("its parts, in training")
     for axes in (whole, parts):
-        axes.set(xlabel="optimiser step", yscale="log")
+        # Likelihoods fall below zero; what lies near it is drawn to scale.
+        axes.set(xlabel="optimiser step", yscale="symlog")
         axes.yaxis.set_major_formatter("{x:g}")
-        axes.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
-        axes.yaxis.set_minor_formatter("{x:g}")
         axes.grid(alpha=0.3)
         if axes.lines:
             # Below the curves, which leave no corner free.
