@@ -37,6 +37,7 @@ from hvs_suite.policies.belief.geometry import FlangeMotion
 from hvs_suite.policies.belief.residual import RESIDUAL_SIZE, SHIFT, Residual, goal_axes
 
 N_JOINTS = 7
+ACTION_UNITS = 2.0**20
 HEIGHTS_M = (0.0, 0.05, 0.15)
 """Above the goal, along its normal: the plain postures that the head is shown."""
 RECENT_SIZE = 4
@@ -447,7 +448,8 @@ class BeliefNetwork(nn.Module):
             memory: With this observation in it, (B, k).
 
         Returns:
-            Joint position targets in units of the joint range, (B, 7) in [-1, 1].
+            Joint position targets in units of the joint range, (B, 7) in [-1, 1], multiples of
+            1 / `ACTION_UNITS`.
         """
         # The set point goes no faster; what is farther would be let go of later, if at all.
         longest = self.joint_speed * self.cell.period_s
@@ -459,7 +461,9 @@ class BeliefNetwork(nn.Module):
         doubt = doubt.clamp(min=0.0).sqrt()
         lowest = self.lowest_m - arm.BEYOND_M
         target = arm.kept_above(target, goal, normal, doubt, lowest, self.cell.tool_length_m)
-        return (target / self.joint_range).clamp(-1.0, 1.0)
+        # Far finer than the arm goes (3 um at the tip), and logs of it are short.
+        action = (target / self.joint_range).clamp(-1.0, 1.0)
+        return torch.round(action * ACTION_UNITS) / ACTION_UNITS
 
     def _goal(self, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Where the tip is taken to have to go (B, 3) m, and the normal there (B, 3)."""

@@ -120,9 +120,9 @@ def archive(members: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> by
     return buffer.getvalue()
 
 
-def arrays(steps: Any, actions: Any) -> bytes:
+def arrays(steps: Any, actions: Any, name: str = "actions") -> bytes:
     buffer = io.BytesIO()
-    np.savez(buffer, steps=steps, actions=actions)
+    np.savez(buffer, **{"steps": steps, name: actions})
     return buffer.getvalue()
 
 
@@ -192,6 +192,14 @@ LOGS: dict[str, tuple[Callable[[], bytes], str]] = {
     ),
     "actions of eight joints": (
         lambda: arrays(np.array([1]), np.zeros((1, 8), np.float32)),
+        "do not fit together",
+    ),
+    "changes of eight joints": (
+        lambda: arrays(np.array([1]), np.zeros((4, 8, 1), np.uint8), "changes"),
+        "rows of 7",
+    ),
+    "fewer changes than steps": (
+        lambda: arrays(np.array([2]), np.zeros((4, 7, 1), np.uint8), "changes"),
         "do not fit together",
     ),
     "an infinite action": (

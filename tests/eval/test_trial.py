@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 import hvs_suite
@@ -235,6 +236,29 @@ def test_the_action_log_holds_every_action(tmp_path: Path) -> None:
     log = action_log.load(result_file.actions_path(path), result.metadata.actions_sha256)
     assert [len(actions) for actions in log] == [row.settled.steps for row in result.episodes]
     assert sorted(file.name for file in tmp_path.iterdir()) == ["zero.actions.npz", "zero.json"]
+
+
+@pytest.mark.parametrize(
+    ("actions", "arrays"),
+    [
+        (np.random.default_rng(0).uniform(-2.0, 2.0, (50, 7)), {"steps", "actions"}),
+        (np.random.default_rng(0).integers(-(2**21), 2**21, (50, 7)) / 2**20, {"steps", "changes"}),
+        (np.zeros((50, 7)), {"steps", "changes"}),
+        (np.full((50, 7), -0.0), {"steps", "actions"}),
+        (np.full((50, 7), 3e8), {"steps", "actions"}),
+    ],
+    ids=["any", "on a grid", "zeros", "negative zeros", "large"],
+)
+def test_an_action_log_gives_back_what_it_was_given(
+    actions: npt.NDArray[np.float64], arrays: set[str], tmp_path: Path
+) -> None:
+    given = np.split(actions.astype(np.float32), [20, 20, 49])
+    path = tmp_path / "result.actions.npz"
+    path.write_bytes(action_log.encode(given))
+    with np.load(path) as file:
+        assert set(file.files) == arrays
+    found = action_log.load(path, action_log.digest(path))
+    assert [episode.tobytes() for episode in found] == [episode.tobytes() for episode in given]
 
 
 def rows(path: Path) -> tuple[str, Any, bytes]:
