@@ -48,7 +48,7 @@ _FRAMES = Settings.windows * Settings.window_steps
 ABLATIONS: Mapping[str, Ablation] = MappingProxyType(
     {
         WHOLE: Ablation(),
-        "frames, not sequences": Ablation({"window_steps": 1, "windows": _FRAMES}),
+        "windows of one frame": Ablation({"window_steps": 1, "windows": _FRAMES}),
         "linear joint steps": Ablation({"error_scale": LINEAR_SCALE}),
         NO_DAGGER: Ablation(_ALONE),
         "no eye in hand": Ablation({"inputs": ("eth",)}),

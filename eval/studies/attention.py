@@ -10,7 +10,7 @@ import torch
 from hvs_suite.pictures import GREEN, Picture, as_rgb, resize, strip
 from hvs_suite.policies.belief.eye import UV, VISIBLE
 from hvs_suite.policies.checkpoints.files import read_config
-from hvs_suite.policies.checkpoints.loading import Inputs, load_network, network_inputs
+from hvs_suite.policies.checkpoints.loading import load_network, network_inputs
 from hvs_suite.rollout import (
     Action,
     Instructed,
@@ -56,12 +56,17 @@ def draw_attention(folder: Path, env: "Environment", policy: Policy, scenario: i
     seen = _Seen(env, policy)
     run_episode(env, seen, scenario)
     steps = np.unique(np.linspace(0, len(seen.observations) - 1, COLUMNS).round().astype(int))
-    shown = [seen.observations[step] for step in steps]
-    inputs = [network_inputs(network, config, observation) for observation in shown]
+    shown = {step: network_inputs(network, config, seen.observations[step]) for step in steps}
     rows = {
         TITLES[camera]: [
-            _tile(network.eyes[camera], camera, *each, seen.truths[step][camera])
-            for step, *each in zip(steps, [one[camera] for one in shown], inputs, strict=True)
+            _tile(
+                network.eyes[camera],
+                inputs.images[camera],
+                inputs.goal,
+                seen.observations[step][camera],
+                seen.truths[step][camera],
+            )
+            for step, inputs in shown.items()
         ]
         for camera in network.shape.cameras
     }
@@ -92,15 +97,18 @@ class _Seen:
 
 
 def _tile(
-    eye: Any, camera: str, image: npt.NDArray[Any], inputs: Inputs, truth: npt.NDArray[Any]
+    eye: Any,
+    seen: torch.Tensor,
+    goal: torch.Tensor | None,
+    image: npt.NDArray[Any],
+    truth: npt.NDArray[Any],
 ) -> Picture:
     """One picture under its attention, with estimate and truth marked."""
     from PIL import Image, ImageDraw
 
-    tensor = inputs.images[camera]
     with torch.no_grad(), one_torch_thread():
-        heat = eye.attention(tensor, inputs.goal)[0].numpy()
-        sighting = eye(tensor, inputs.goal)[0]
+        heat = eye.attention(seen, goal)[0].numpy()
+        sighting = eye(seen, goal)[0]
     picture = resize(as_rgb(image), _TILE_PX).astype(np.float64)
     spread = Image.fromarray((heat / heat.max()).astype(np.float32), mode="F")
     share = np.asarray(spread.resize((_TILE_PX, _TILE_PX), Image.Resampling.BILINEAR))[..., None]

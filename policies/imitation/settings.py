@@ -164,7 +164,7 @@ def _inputs(manifest: Manifest) -> dict[str, Any]:
         for name, shape in manifest.cameras.items()
     }
     for key in (STATE, *further_keys(manifest.features)):
-        if key in manifest.features:
+        if key is not None and key in manifest.features:
             kind = FeatureType.STATE if key == STATE else FeatureType.ENV
             inputs[key] = PolicyFeature(kind, tuple(manifest.features[key]["shape"]))
     return inputs

@@ -35,7 +35,7 @@ class Settings:
         penalty: Weight of the squared action against the normalised value.
         shaping: Weight of the potential, which is minus the logarithm of the error.
         step_cost: What a step costs.
-        environments: Processes that play.
+        environments: How many play, in processes of their own; a single one in the learner's.
     """
 
     sideways_m: float = 0.0004

@@ -15,13 +15,13 @@ import math
 import shutil
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from torch import Tensor
 
 from hvs_suite.executor import worker_conditions
@@ -152,10 +152,8 @@ def finetune(
             contextlib.closing(Curves(training / "tensorboard", counts["env_steps"] + 1))
         )
         with worker_conditions():
-            players = AsyncVectorEnv(
-                [dataclasses.replace(make, part=i, place=places[i]) for i in range(n)],
-                context="spawn",
-                autoreset_mode=AutoresetMode.SAME_STEP,
+            players = _players(
+                [dataclasses.replace(make, part=i, place=places[i]) for i in range(n)]
             )
         stack.callback(players.close)
         seen, info = players.reset()
@@ -280,6 +278,25 @@ def finetune(
             report("training", budget.share(counts["env_steps"], counts["elapsed_s"]))
         draw_rl_run(training, evaluations)
         return outcome()
+
+
+class _PlayerHere(SyncVectorEnv):
+    """A single player in this process: a study's worker may have no processes of its own."""
+
+    def step_async(self, actions: Any) -> None:
+        """Take an action; it is played when the result is asked for."""
+        self._sent = actions
+
+    def step_wait(self) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Play it."""
+        return self.step(self._sent)
+
+
+def _players(make: Sequence[MakeStage]) -> AsyncVectorEnv | _PlayerHere:
+    """Players in processes of their own, but for a single one."""
+    if len(make) == 1:
+        return _PlayerHere(make, autoreset_mode=AutoresetMode.SAME_STEP)
+    return AsyncVectorEnv(make, context="spawn", autoreset_mode=AutoresetMode.SAME_STEP)
 
 
 class Learner:

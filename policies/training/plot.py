@@ -15,10 +15,9 @@ if TYPE_CHECKING:
 PICTURE = "training.png"
 # Means over so many logged points (of 20 steps each), so that a line shows and not a cloud.
 SMOOTHED_POINTS = 10
-PARTS = {
+EYES = {"eih_loss": "eye in hand", "eth_loss": "eye to hand"}
+REST = {
     "action_loss": "action",
-    "eih_loss": "eye in hand",
-    "eth_loss": "eye to hand",
     "tip_loss": "where the tip goes",
     "belief_place_loss": "place of the target",
 }
@@ -38,21 +37,23 @@ def draw_run(out: Path) -> Path:
         OutputError: It cannot be written.
     """
     from matplotlib.figure import Figure
-    from matplotlib.ticker import LogLocator
 
     curves = read_curves(out / "training" / "tensorboard")
     rounds = _rounds(out / "training" / "dagger")
     figure = Figure(figsize=(11.0, 3.6), layout="constrained")
-    whole, parts, played = figure.subplots(1, 3)
-    _draw(whole, curves, {"train/loss": "training", "held_out/loss": "held out"})
-    _draw(parts, curves, {f"train/{key}": name for key, name in PARTS.items()})
-    whole.set_title("loss")
-    parts.set_title("its parts, in training")
-    for axes in (whole, parts):
-        axes.set(xlabel="optimiser step", yscale="log")
-        axes.yaxis.set_major_formatter("{x:g}")
-        axes.yaxis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
-        axes.yaxis.set_minor_formatter("{x:g}")
+    eyes, rest, played = figure.subplots(1, 3)
+    _draw(eyes, curves, {f"train/{key}": name for key, name in EYES.items()})
+    eyes.set_prop_cycle(None)
+    held_out = {f"held_out/{key}": f"{name}, held out" for key, name in EYES.items()}
+    _draw(eyes, curves, held_out, linestyle="--")
+    _draw(rest, curves, {f"train/{key}": name for key, name in REST.items()})
+    eyes.set_title("loss of the eyes")
+    rest.set_title("losses of belief and head, in their turns")
+    # Likelihoods fall below zero; what lies near it is drawn to scale.
+    eyes.set_yscale("symlog")
+    eyes.yaxis.set_major_formatter("{x:g}")
+    for axes in (eyes, rest):
+        axes.set(xlabel="optimiser step")
         axes.grid(alpha=0.3)
         if axes.lines:
             # Below the curves, which leave no corner free.
@@ -96,7 +97,9 @@ def _rounds(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(path.read_text()) for path in paths]
 
 
-def _draw(axes: "Axes", curves: dict[str, Curve], names: dict[str, str]) -> None:
+def _draw(
+    axes: "Axes", curves: dict[str, Curve], names: dict[str, str], linestyle: str = "-"
+) -> None:
     for key, name in names.items():
         if key not in curves:
             continue
@@ -105,7 +108,7 @@ def _draw(axes: "Axes", curves: dict[str, Curve], names: dict[str, str]) -> None
             weights = np.full(SMOOTHED_POINTS, 1.0 / SMOOTHED_POINTS)
             values = np.convolve(values, weights, mode="valid")
             steps = steps[SMOOTHED_POINTS - 1 :]
-        axes.plot(steps, values, label=name, linewidth=1.2)
+        axes.plot(steps, values, label=name, linewidth=1.2, linestyle=linestyle)
 
 
 def _draw_rounds(axes: "Axes", rounds: list[dict[str, Any]]) -> None:

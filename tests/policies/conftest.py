@@ -28,5 +28,5 @@ def checkpoint(large_dataset: Path, tmp_path_factory: pytest.TempPathFactory) ->
     from hvs_suite.policies.imitation.pretrain import pretrain
 
     out = tmp_path_factory.mktemp("checkpoint")
-    pretrain(large_dataset, out, steps=2, batch_size=4)
+    pretrain(large_dataset, out, steps=2, batch_size=4, windows=4, window_steps=4)
     return out

@@ -18,10 +18,14 @@ from hvs_suite.errors import OutputError, PolicyError
 from hvs_suite.policies.imitation.frame_cache import cached_frames, new_frames
 from hvs_suite.policies.imitation.pretrain import pretrain
 from hvs_suite.policies.imitation.state import Counters, load_state, save_state
+from hvs_suite.policies.imitation.teacher import Teacher
 from hvs_suite.policies.training import run_folder
 from hvs_suite.policies.training.curves import Curves
 
-RUN = {"steps": 6, "batch_size": 8, "seed": 3, "checkpoint_period_s": 0.0}
+RUN = {
+    "steps": 6, "batch_size": 8, "windows": 4, "window_steps": 4, "seed": 3,
+    "checkpoint_period_s": 0.0,
+}  # fmt: skip
 WORDS = "pretrain --data {data} --out {out} --steps 6 --seed 3"
 
 
@@ -67,12 +71,16 @@ class Killed(BaseException):
     """What a kill looks like to the loop."""
 
 
-def kill_after_three(progress):
-    if progress.step == 3:
-        raise Killed
+def kill_after(step):
+    def on_progress(progress):
+        if progress.step == step:
+            raise Killed
+
+    return on_progress
 
 
-# The decoded frames of a camera take 94 kB, the weights 1 MB, the state of the run 3 MB.
+# The decoded frames of a camera take 94 kB, the weights 2 MB before they are halved, the run's
+# state 6 MB.
 @pytest.mark.usefixtures("room")
 @pytest.mark.parametrize("begun", [False, True])
 @pytest.mark.parametrize("size", [0, 50_000, 2_000_000])
@@ -80,7 +88,7 @@ def test_a_run_that_cannot_write_goes_on_when_it_can(dataset, tmp_path, whole, s
     out = tmp_path / "run"
     if begun:
         with pytest.raises(Killed):
-            pretrain(dataset, out, on_progress=kill_after_three, **RUN)
+            pretrain(dataset, out, on_progress=kill_after(3), **RUN)
     kept = (out / "model.safetensors").read_bytes() if begun else None
     allow(size)
     with pytest.raises(OutputError) as refusal:
@@ -166,25 +174,20 @@ def test_a_dataset_with_numbers_that_are_none_is_refused(tmp_path, capsys, key, 
 
 @pytest.mark.parametrize("where", ["loss", "gradient"])
 def test_a_run_that_comes_apart_keeps_its_last_good_weights(dataset, tmp_path, monkeypatch, where):
-    from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
-
     out = tmp_path / "run"
     with pytest.raises(Killed):
-        pretrain(dataset, out, on_progress=kill_after_three, **RUN)
+        pretrain(dataset, out, on_progress=kill_after(2), **RUN)
     shutil.copytree(out, tmp_path / "before")
-    sound = HvsPolicy.supervise
+    sound = Teacher.lesson
 
-    def unsound(self, batch):
-        import dataclasses
-
-        lesson = sound(self, batch)
-        gain = self.network.step_gain.sum()
+    def unsound(self, rows, step):
+        loss, parts = sound(self, rows, step)
+        lead = self.policy.network.lead_s
         # The root of 0 is 0, and its slope is infinite.
-        spoilt = lesson.loss * np.nan if where == "loss" else (gain - gain.detach()).sqrt()
-        return dataclasses.replace(lesson, loss=spoilt)
+        return loss * np.nan if where == "loss" else (lead - lead.detach()).sqrt(), parts
 
-    monkeypatch.setattr(HvsPolicy, "supervise", unsound)
-    with pytest.raises(PolicyError, match="came apart at step 4"):
+    monkeypatch.setattr(Teacher, "lesson", unsound)
+    with pytest.raises(PolicyError, match="came apart at step 3"):
         pretrain(dataset, out, **RUN)
     for name in ("model.safetensors", "training/state.safetensors"):
         assert (out / name).read_bytes() == (tmp_path / "before" / name).read_bytes()

@@ -269,7 +269,6 @@ DAMAGES: dict[str, Damage] = {
             "hidden": [None, 2**31, 4096],
             "error_scale": [None, "small", 0, -1.0],
             "residual_hidden": [None, -3, 2**40, 64],
-            "from_set_point": [None, "yes", 2, True],
         }.items()
         for value in values
     },
@@ -316,7 +315,7 @@ DAMAGES: dict[str, Damage] = {
     "a tensor missing": weights(lambda tensors: tensors.popitem()),
     "a tensor too many": weights(lambda tensors: tensors.update(more=np.zeros(3, np.float32))),
     "a tensor of another shape": weights(
-        lambda tensors: tensors.update({"network.memory_trust": np.zeros(3, np.float32)})
+        lambda tensors: tensors.update({"network.lead_s": np.zeros(3, np.float32)})
     ),
     **{
         f"state file {name!r}": state_file(name)
