@@ -9,7 +9,8 @@ then, the eye in hand looks down all around the base.
 If the pose of the eye-to-hand camera is not exact, it locates the target only within some
 centimetres. An arm that goes there at once ends up beside the target, too low for the eye in hand
 to see it. So until the eye in hand has seen the target, the demonstrator heads for a place above
-it, from which the eye in hand can see it. Above a target that moves, it moves along.
+it, from which the eye in hand can see it. Above a target that moves, it moves along. If no camera
+sees the target from there, what the eye-to-hand camera saw of it was too little, and it looks again.
 
 A target that is suddenly elsewhere counts as a new one that has not been seen.
 
@@ -48,6 +49,8 @@ LOOK_AROUND_RAD: FloatArray = np.array(
 LOOK_DOWN_M = 0.15
 """How far above the goal the eye in the hand looks for the target (m): high enough to have it in
 view wherever the eye-to-hand camera may take it to be, and hardly a detour."""
+DOWN_M = 0.02
+"""So much higher than that still counts as there (m)."""
 CLEARANCE_M = 0.03
 """What demonstrations keep from surface, self and obstacles where they can (m): what imitates a way
 that passes at 10 mm touches, some of the time."""
@@ -109,8 +112,15 @@ class Demonstrator(Expert):
         """Notice whether a camera has the target in view."""
         truth, [target, *_] = self._env.privileged(), self._env.spec.keypoints
         seen = {name: truth[f"{target}_{name}"][3] > 0.5 for name in CAMERA_NAMES}
-        self._has_seen = self._has_seen or any(seen.values())
         self._has_seen_closely = self._has_seen_closely or bool(seen["eih"])
+        in_vain = not self._has_seen_closely and self._has_come_down()
+        self._has_seen = (self._has_seen and not in_vain) or any(seen.values())
+
+    def _has_come_down(self) -> bool:
+        """Whether the tip is about as low as where the eye in the hand looks from."""
+        goal = self._env.goal()
+        height = goal.normal @ (self._env.tip().position - goal.position)
+        return bool(height < LOOK_DOWN_M + DOWN_M)
 
 
 def _is_same(target: FloatArray, goal: Goal) -> bool:

@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from hvs_suite.cell.cameras import look_at
+from hvs_suite.datasets.planner import LEAD_S
 from hvs_suite.policies.belief.network import CellModel
 from hvs_suite.tasks.shared.spec import Spec
 
@@ -21,6 +22,8 @@ def cell_model(spec: Spec) -> CellModel:
     axes, place = spec.embodiment.hand_eye
     return CellModel(
         period_s=spec.control_period_s,
+        latency_steps=spec.latency_steps,
+        lead_s=LEAD_S * spec.embodiment.slowness,
         tool_length_m=spec.embodiment.tool_length_m,
         tan={
             name: math.tan(math.radians(getattr(spec, f"{name}_fov_deg")) / 2.0)

@@ -14,7 +14,7 @@ from hvs_suite.policies.belief import geometry
 from hvs_suite.policies.belief.belief import BELIEF_SIZE, View, belief_loss
 from hvs_suite.policies.belief.control_loss import TIP_WEIGHT, action_loss, tip_loss
 from hvs_suite.policies.belief.eye import sighting_loss
-from hvs_suite.policies.belief.network import BEGUN, N_JOINTS, SET_POINT, BeliefNetwork
+from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
 from hvs_suite.policies.belief.recorded import Recorded
 
 Parts = dict[str, Tensor]
@@ -78,8 +78,7 @@ def remembered(network: BeliefNetwork, window: Window) -> Tensor:
     }
     memory, memories = window.memory, []
     for t in range(length):
-        memory = memory.clone()
-        memory[:, SET_POINT], memory[:, BEGUN] = window.truth.set_point[:, t].double(), 1.0
+        memory = network.sent_on(memory, window.truth.set_point[:, t].double())
         memory = network.remember(
             memory,
             {name: sighting[:, t] for name, sighting in window.sightings.items()},

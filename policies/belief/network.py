@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
+from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S, LAG_S
 from hvs_suite.policies.belief import arm, geometry
 from hvs_suite.policies.belief.belief import (
     ACCELERATION,
@@ -51,6 +51,8 @@ class CellModel:
 
     Attributes:
         period_s: Control period (s).
+        latency_steps: Control steps between an action and its effect.
+        lead_s: How far a set point runs ahead of the joints on a way (s).
         tool_length_m: From the flange to the tip (m).
         tan: Camera name to the tangent of half its field of view.
         eth_origin: Nominal place of the eye to hand, (3,) m.
@@ -60,6 +62,8 @@ class CellModel:
     """
 
     period_s: float
+    latency_steps: int
+    lead_s: float
     tool_length_m: float
     tan: Mapping[str, float]
     eth_origin: tuple[float, ...]
@@ -98,10 +102,12 @@ class Shape:
     residual_reach_m: float = 0.02
 
 
-MEMORY_SIZE = BELIEF_SIZE + N_JOINTS + 1 + RECENT_SIZE
+MEMORY_SIZE = BELIEF_SIZE + 2 * N_JOINTS + 1 + RECENT_SIZE
 SET_POINT = slice(BELIEF_SIZE, BELIEF_SIZE + N_JOINTS)
-BEGUN = slice(BELIEF_SIZE + N_JOINTS, BELIEF_SIZE + N_JOINTS + 1)
-RECENT = slice(BELIEF_SIZE + N_JOINTS + 1, MEMORY_SIZE)
+TRAILING = slice(SET_POINT.stop, SET_POINT.stop + N_JOINTS)
+"""Where the joints will be when they have been sent to the set point for a control step."""
+BEGUN = slice(TRAILING.stop, TRAILING.stop + 1)
+RECENT = slice(BEGUN.stop, MEMORY_SIZE)
 FELT = slice(MEMORY_SIZE, MEMORY_SIZE + RESIDUAL_SIZE)
 """Where what the residual remembers stands, in networks that have one."""
 
@@ -127,6 +133,7 @@ class BeliefNetwork(nn.Module):
     joint_range: Tensor
     joint_speed: Tensor
     lowest_m: Tensor
+    lag_s: Tensor
 
     def __init__(self, shape: Shape, cell: CellModel) -> None:
         super().__init__()
@@ -146,6 +153,7 @@ class BeliefNetwork(nn.Module):
         self.register_buffer(
             "joint_speed", torch.tensor(JOINT_SPEED_RAD_S, dtype=torch.float32), persistent=False
         )
+        self.register_buffer("lag_s", torch.from_numpy(LAG_S), persistent=False)
         n = len(cameras)
         hidden = shape.hidden
         width = 3 * N_JOINTS + N_JOINTS + N_JOINTS  # q, velocity, pending
@@ -253,7 +261,10 @@ class BeliefNetwork(nn.Module):
         if views is None:
             views = self.views(geometry.flange_motion(q.double()))
         believed, forget = self.belief(memory[:, :BELIEF_SIZE], sightings, views)
-        set_point = torch.where(memory[:, BEGUN] > 0, memory[:, SET_POINT], q.double())
+        begun = memory[:, BEGUN] > 0
+        set_point, trailing = (
+            torch.where(begun, memory[:, part], q.double()) for part in (SET_POINT, TRAILING)
+        )
         recent = memory[:, RECENT]
         logits = torch.cat(
             [s[:, VISIBLE] for s in sightings.values()]
@@ -264,8 +275,8 @@ class BeliefNetwork(nn.Module):
         # Not seen since it was last forgotten: 1; falls to 0 when it is seen.
         unseen = torch.maximum(recent[:, :2], forget) * (1.0 - seen)
         away = (1.0 - seen) * (recent[:, 2:] * 0.9 + 0.1)
-        begun = torch.ones_like(set_point[:, :1])
-        return torch.cat([believed, set_point, begun, unseen, away, memory[:, MEMORY_SIZE:]], dim=1)
+        parts = [believed, set_point, trailing, torch.ones_like(set_point[:, :1]), unseen, away]
+        return torch.cat([*parts, memory[:, MEMORY_SIZE:]], dim=1)
 
     def feel(
         self,
@@ -317,8 +328,25 @@ class BeliefNetwork(nn.Module):
         set_point = memory[:, SET_POINT]
         longest = (self.joint_speed * self.cell.period_s).double()
         way = (action * self.joint_range).double() - set_point
+        return self.sent_on(
+            memory, set_point + torch.maximum(torch.minimum(way, longest), -longest)
+        )
+
+    def sent_on(self, memory: Tensor, set_point: Tensor) -> Tensor:
+        """The memory once the set point has gone on to another, (B, 7) rad, in a control step.
+
+        How the joints trail is `hvs_suite.cell.robot.after_commands`. Where nothing is remembered
+        yet, they rest at the set point.
+        """
+        before, trailing = memory[:, SET_POINT], memory[:, TRAILING]
+        trail = self.lag_s * (set_point - before) / self.cell.period_s
+        decay = torch.exp(-self.cell.period_s / self.lag_s)
+        trailing = set_point - trail + (trailing - before + trail) * decay
+        begun = memory[:, BEGUN] > 0
         memory = memory.clone()
-        memory[:, SET_POINT] = set_point + torch.maximum(torch.minimum(way, longest), -longest)
+        memory[:, SET_POINT] = set_point
+        memory[:, TRAILING] = torch.where(begun, trailing, set_point)
+        memory[:, BEGUN] = 1.0
         return memory
 
     def decide(
@@ -357,12 +385,15 @@ class BeliefNetwork(nn.Module):
         waypoint = waypoint + gain[:, :1] * (ahead - here.position)
         waypoint = waypoint + gain[:, 1:] * (ahead - sent.position)
         proposals = [arm.joint_step(sent, waypoint - sent.position, normal)]
+        joints, velocity = self._moving(memory, state)
         ways = []
         tool = self.cell.tool_length_m
         for height in HEIGHTS_M:
             over = (ahead + (height + tool) * normal).detach()
-            turns, time_s, within = arm.way_to_posture(set_point, over, normal.detach())
-            step = turns * arm.share_of_way(turns, self.cell.period_s)
+            turns, time_s, within = arm.way_to_posture(joints, over, normal.detach())
+            ahead_s = self.cell.period_s + self.cell.lead_s
+            gone = arm.along_way(turns, velocity[:, :-1], ahead_s)
+            step = gone + (joints - set_point)[:, :-1]
             proposals.append(F.pad(step, (0, 1)))
             ways += [torch.asinh(turns / scale), time_s, within]
             ways.append(torch.asinh(step / scale))
@@ -373,6 +404,13 @@ class BeliefNetwork(nn.Module):
         mean = (weights.softmax(dim=1)[:, :, None] * torch.stack(proposals, dim=1)).sum(dim=1)
         total = torch.asinh(mean / scale) + torch.sigmoid(is_corrected) * correction
         return total
+
+    def _moving(self, memory: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Joints (B, 7) rad and their velocities (rad/s) when the next action takes effect."""
+        if not self.cell.latency_steps:
+            return state[:, :N_JOINTS], state[:, N_JOINTS:]
+        trailing = memory[:, TRAILING]
+        return trailing.float(), ((memory[:, SET_POINT] - trailing) / self.lag_s).float()
 
     def _place(self, memory: Tensor, q: Tensor) -> _Place:
         """Where the tip is by measured joints (B, 7) and set point, and where it has to go."""

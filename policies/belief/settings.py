@@ -38,6 +38,8 @@ class Cell(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(extra="forbid")
 
     period_s: Period
+    latency_steps: Annotated[int, pydantic.Field(strict=True, ge=0, le=100)]
+    lead_s: Annotated[float, pydantic.Field(strict=True, ge=0.0, le=1.0)]
     tool_length_m: Annotated[float, pydantic.Field(strict=True, ge=0.0, le=2.0)]
     tan: dict[str, Tangent]
     eth_origin: Place

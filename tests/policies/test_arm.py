@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+import ruckig
 import torch
 from torch import Tensor
 
@@ -93,17 +94,31 @@ def test_a_tip_that_is_high_enough_or_far_beside_is_left_alone() -> None:
     assert (arm.kept_above(q, far, normal, doubt, NOWHERE, 0.0) == q).all()
 
 
-def test_a_step_along_a_way_leaves_room_to_brake() -> None:
-    period_s = 0.1
-    turns = 3.0 * torch.randn(200, 6, generator=torch.Generator().manual_seed(2)) ** 3
-    step = turns * arm.share_of_way(turns, period_s)
-    fastest, braking = (
-        torch.tensor(limits[:6])
-        for limits in (robot.JOINT_SPEED_RAD_S, robot.JOINT_ACCELERATION_RAD_S2)
-    )
-    speed = step.abs() / period_s
-    assert (speed <= fastest * (1.0 + 1e-5)).all()
-    needed = speed**2 / (2.0 * braking) + 0.5 * period_s * speed
-    assert ((needed <= turns.abs() * (1.0 + 1e-4)) | (step.abs() <= fastest * 1e-3)).all()
-    near = torch.full((1, 6), 1e-4)
-    torch.testing.assert_close(arm.share_of_way(near, period_s), torch.ones(1, 1))
+@pytest.mark.parametrize("time_s", [0.02, 0.125, 0.5])
+def test_joints_on_their_way_are_where_the_planner_has_them(time_s: float) -> None:
+    random = np.random.default_rng(2)
+    fastest, braking = robot.JOINT_SPEED_RAD_S[:6], robot.JOINT_ACCELERATION_RAD_S2[:6]
+    turns = 0.5 * random.normal(size=(300, 6)) ** 3
+    velocity = random.uniform(-1.0, 1.0, (300, 6)) * fastest
+    velocity[:100] *= 0.05
+    plan = ruckig.InputParameter(6)
+    plan.max_velocity, plan.max_acceleration = fastest.tolist(), braking.tolist()
+    plan.current_position = [0.0] * 6
+    expected = []
+    for way, speed in zip(turns, velocity, strict=True):
+        plan.target_position, plan.current_velocity = way.tolist(), speed.tolist()
+        motion = ruckig.Trajectory(6)
+        ruckig.Ruckig(6).calculate(plan, motion)
+        expected.append(motion.at_time(min(time_s, motion.duration))[0])
+    found = arm.along_way(torch.from_numpy(turns), torch.from_numpy(velocity), time_s)
+    # A joint that has too much time may use it in more than one way.
+    off = np.abs(found.numpy() - np.array(expected))
+    assert np.quantile(off, 0.9) < 1e-6
+    assert (off <= np.abs(turns) + 0.02 * np.abs(velocity)).all()
+
+
+def test_joints_rest_at_the_end_of_their_way() -> None:
+    turns, velocity = torch.tensor([[0.3, -0.2, 0.0, 0.1, -0.4, 0.2]]), torch.zeros(1, 6)
+    torch.testing.assert_close(arm.along_way(turns, velocity, 5.0), turns)
+    nothing = torch.zeros(1, 6)
+    torch.testing.assert_close(arm.along_way(nothing, nothing, 0.1), nothing)
