@@ -10,6 +10,7 @@ If the pose of the eye-to-hand camera is not exact, it locates the target only w
 centimetres. An arm that goes there at once ends up beside the target, too low for the eye in hand
 to see it. So until the eye in hand has seen the target, the demonstrator heads for a place above
 it, from which the eye in hand can see it. Above a target that moves, it moves along. If no camera
+sees it from there, the eye-to-hand camera saw too little of it, and it looks again.
 
 A target that is suddenly elsewhere counts as a new one that has not been seen.
 
