@@ -44,6 +44,7 @@ MIN_DEPTH_M = 0.02
 GATES_A_CAMERA = 4
 GATES = 4
 """Of all cameras: forgetting, and how much place, motion and slope may have changed."""
+CHANGE_SLOPE = 3.0
 FORGET_SLOPE = 5.0
 FORGET_AT = 3.2
 """A share of 1e-7 is forgotten where the gate says 0: of half a metre, a tenth of a millimetre."""
@@ -122,7 +123,7 @@ class Belief(nn.Module):
         transition[PLACE, ACCELERATION] = 0.5 * period_s**2 * eye3
         self.register_buffer("transition", transition, persistent=False)
         # Floors of what cameras tell: angle (rad), place (m), share of a distance, slope.
-        floors = torch.tensor([2e-3, 5e-4, 0.01, 0.01]).log().repeat(n, 1)
+        floors = torch.tensor([5e-4, 1e-4, 0.01, 0.01]).log().repeat(n, 1)
         self.log_floors = nn.Parameter(floors)
         last = nn.Linear(hidden, GATES_A_CAMERA * n + GATES)
         nn.init.zeros_(last.weight)
@@ -180,11 +181,10 @@ class Belief(nn.Module):
         x = keep * x + forget * start[MOTION]
         P = keep[:, :, None] * P + forget[:, :, None] * prior_P
         prior_variance = torch.diagonal(prior_P)
-        change = torch.exp(common[:, 1:].clamp(-6.0, 6.0))
-        q = torch.cat(
-            [1e-10 * change[:, :1].expand(n, 3), prior_variance[3:] * 1e-3 * change[:, 1:2]],
-            dim=1,
-        )
+        change = torch.exp((CHANGE_SLOPE * common[:, 1:]).clamp(-6.0, 6.0))
+        # Velocities change by accelerations, and hardly otherwise.
+        of_prior = prior_variance[3:] * torch.tensor([1e-6] * 3 + [1e-3] * 3, dtype=P.dtype)
+        q = torch.cat([1e-10 * change[:, :1].expand(n, 3), of_prior * change[:, 1:2]], dim=1)
         P = P + torch.diag_embed(q)
         slope = keep * slope + forget * start[TILT]
         slope_var = keep * slope_var + forget * start[TILT_VARIANCE] + 1e-8 * change[:, 2:]
