@@ -49,8 +49,8 @@ LOOK_AROUND_RAD: FloatArray = np.array(
 LOOK_DOWN_M = 0.15
 """How far above the goal the eye in the hand looks for the target (m): high enough to have it in
 view wherever the eye-to-hand camera may take it to be, and hardly a detour."""
-DOWN_M = 0.02
-"""So much higher than that still counts as there (m)."""
+AT_REST_RAD_S = 0.05
+"""Slower than this the arm has arrived (rad/s)."""
 CLEARANCE_M = 0.03
 """What demonstrations keep from surface, self and obstacles where they can (m): what imitates a way
 that passes at 10 mm touches, some of the time."""
@@ -113,14 +113,9 @@ class Demonstrator(Expert):
         truth, [target, *_] = self._env.privileged(), self._env.spec.keypoints
         seen = {name: truth[f"{target}_{name}"][3] > 0.5 for name in CAMERA_NAMES}
         self._has_seen_closely = self._has_seen_closely or bool(seen["eih"])
-        in_vain = not self._has_seen_closely and self._has_come_down()
+        rests = np.abs(self._env.joint_velocities).max() < AT_REST_RAD_S
+        in_vain = not self._has_seen_closely and rests
         self._has_seen = (self._has_seen and not in_vain) or any(seen.values())
-
-    def _has_come_down(self) -> bool:
-        """Whether the tip is about as low as where the eye in the hand looks from."""
-        goal = self._env.goal()
-        height = goal.normal @ (self._env.tip().position - goal.position)
-        return bool(height < LOOK_DOWN_M + DOWN_M)
 
 
 def _is_same(target: FloatArray, goal: Goal) -> bool:
