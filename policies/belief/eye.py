@@ -15,6 +15,9 @@ FEATURE_SIZE = 28
 """Cells along the side of a feature map, about."""
 PATCH_SIZE = 8
 PATCH_CHANNELS = 16
+N_POINTS = 8
+POINTS_SIZE = 20
+POINTS_GAIN = 10.0
 PATCH_DIAMETERS = 2.5
 """The patch around the target reaches so many of its diameters to either side."""
 SIGHTING_SIZE = 9
@@ -94,8 +97,9 @@ class Eye(nn.Module):
         nn.init.zeros_(last.weight)
         with torch.no_grad():
             last.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 0.0, -3.5, -2.0, 0.0, 0.0, -1.0]))
-        n_patch = PATCH_CHANNELS * PATCH_SIZE**2
-        self.judge = nn.Sequential(nn.Linear(2 * channels + n_patch + 5, 128), nn.SiLU(), last)
+        self.points = nn.Linear(channels, N_POINTS)
+        n_around = PATCH_CHANNELS * PATCH_SIZE**2 + 4 * N_POINTS
+        self.judge = nn.Sequential(nn.Linear(2 * channels + n_around + 5, 128), nn.SiLU(), last)
 
     def forward(self, images: Tensor, goal: Tensor | None = None) -> Tensor:
         """Look.
@@ -117,10 +121,10 @@ class Eye(nn.Module):
         flat = maps.flatten(1, 2)
         pooled = torch.cat([(weights[:, None] @ flat)[:, 0], flat.amax(dim=1)], dim=1)
         size = self.first_size(torch.cat([pooled, uv, u_spread, v_spread], dim=1))
-        patch = self._around(maps, uv.detach(), size.detach())
-        judged = self.judge(
-            torch.cat([pooled, patch.flatten(1), uv, u_spread, v_spread, size], dim=1)
-        )
+        place = uv.detach(), size.detach()
+        patch = _around(self.patch(maps), *place, PATCH_SIZE).flatten(1)
+        points = _points(_around(self.points(maps), *place, POINTS_SIZE))
+        judged = self.judge(torch.cat([pooled, patch, points, uv, u_spread, v_spread, size], dim=1))
         # A mark that is cut by the image's border has its centre elsewhere than what is in view.
         return torch.cat([uv + judged[:, UV], size + judged[:, LOG_DIAMETER], judged[:, 3:]], dim=1)
 
@@ -136,16 +140,6 @@ class Eye(nn.Module):
         """
         scores = self.score(self._maps(images, goal))[..., 0]
         return torch.softmax(scores.flatten(1), dim=1).view_as(scores)
-
-    def _around(self, maps: Tensor, uv: Tensor, log_diameter: Tensor) -> Tensor:
-        """Features around a place, its surroundings scaled by the target's size."""
-        reach = (PATCH_DIAMETERS * 2.0 * log_diameter.exp()).clamp(0.15, 1.2)
-        ticks = torch.linspace(-1.0, 1.0, PATCH_SIZE, device=maps.device)
-        dv, du = torch.meshgrid(ticks, ticks, indexing="ij")
-        offsets = torch.stack([du, dv], dim=2)[None]  # (1, k, k, 2)
-        at = uv[:, None, None] + reach[:, None, None] * offsets
-        narrow = self.patch(maps).permute(0, 3, 1, 2)
-        return F.grid_sample(narrow, at, align_corners=False, padding_mode="zeros")
 
     def _maps(self, images: Tensor, goal: Tensor | None) -> Tensor:
         """Features of every cell, (B, h, w, channels)."""
@@ -165,6 +159,38 @@ class Eye(nn.Module):
         return self.chosen(maps)
 
 
+def _around(maps: Tensor, uv: Tensor, log_diameter: Tensor, size: int) -> Tensor:
+    """Features around a place, its surroundings scaled by the target's size.
+
+    Args:
+        maps: (B, h, w, c).
+        uv: The place, (B, 2).
+        log_diameter: Of the target, (B, 1).
+        size: Samples in a row.
+
+    Returns:
+        (B, c, size, size).
+    """
+    reach = (PATCH_DIAMETERS * 2.0 * log_diameter.exp()).clamp(0.15, 1.2)
+    ticks = torch.linspace(-1.0, 1.0, size, device=maps.device)
+    dv, du = torch.meshgrid(ticks, ticks, indexing="ij")
+    offsets = torch.stack([du, dv], dim=2)[None]  # (1, k, k, 2)
+    at = uv[:, None, None] + reach[:, None, None] * offsets
+    return F.grid_sample(maps.permute(0, 3, 1, 2), at, align_corners=False, padding_mode="zeros")
+
+
+def _points(scores: Tensor) -> Tensor:
+    """Where each channel's softmax lies and how wide it is: (B, c, k, k) to (B, 4 c).
+
+    What surrounds a target shows its slope by where it lies: the near half of a ring of marks is
+    farther from the target's centre than the far half, by a few hundredths of what is in view.
+    """
+    grid = scores.flatten(2).softmax(dim=2).view_as(scores)
+    moments = [_moments(grid.sum(dim=axis).flatten(0, 1)) for axis in (2, 3)]
+    both = torch.cat([torch.cat([POINTS_GAIN * mean, spread], dim=1) for mean, spread in moments])
+    return both.view(2, len(scores), -1).permute(1, 0, 2).flatten(1)
+
+
 def _moments(marginal: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation in [-1, 1] of a distribution over n cells, (B, 1) each."""
     n = marginal.shape[1]
@@ -179,9 +205,8 @@ def sighting_loss(
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Loss of a camera against the projected target.
 
-    Centre and size are learned by Huber losses, and their doubts by the likelihood of the errors
-    that remain; the normal and its doubt by the likelihood alone, because most images tell nothing
-    of it.
+    Centre, size and normal are learned by Huber losses, and their doubts by the likelihood of the
+    errors that remain.
 
     Args:
         sighting: (B, 9).
@@ -209,7 +234,10 @@ def sighting_loss(
         ),
         "sigma_uv": 0.1 * mean(_doubt(off.detach(), sighting[:, LOG_SIGMA_UV])),
         "sigma_size": 0.1 * mean(_doubt(size_off.detach(), sighting[:, LOG_SIGMA_SIZE])),
-        "slope": 0.1 * mean(_doubt(slope_off, sighting[:, LOG_SIGMA_SLOPE])),
+        "slope": mean(
+            F.smooth_l1_loss(slope_off, torch.zeros_like(slope_off), beta=0.02, reduction="none")
+        ),
+        "sigma_slope": 0.1 * mean(_doubt(slope_off.detach(), sighting[:, LOG_SIGMA_SLOPE])),
         "visible": 0.3 * F.binary_cross_entropy_with_logits(sighting[:, VISIBLE], visible),
     }
     return sum(parts.values(), torch.zeros(())), parts
