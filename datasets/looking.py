@@ -113,9 +113,18 @@ class Demonstrator(Expert):
         truth, [target, *_] = self._env.privileged(), self._env.spec.keypoints
         seen = {name: truth[f"{target}_{name}"][3] > 0.5 for name in CAMERA_NAMES}
         self._has_seen_closely = self._has_seen_closely or bool(seen["eih"])
-        rests = np.abs(self._env.joint_velocities).max() < AT_REST_RAD_S
-        in_vain = not self._has_seen_closely and rests
+        in_vain = not self._has_seen_closely and self._waits_above()
         self._has_seen = (self._has_seen and not in_vain) or any(seen.values())
+
+    def _waits_above(self) -> bool:
+        """Whether the arm rests as high as where the eye in the hand looks from, or higher.
+
+        One that rests lower has only to go up.
+        """
+        goal = self._env.goal()
+        height = goal.normal @ (self._env.tip().position - goal.position)
+        rests = np.abs(self._env.joint_velocities).max() < AT_REST_RAD_S
+        return bool(rests and height > 0.8 * LOOK_DOWN_M)
 
 
 def _is_same(target: FloatArray, goal: Goal) -> bool:
