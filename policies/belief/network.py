@@ -38,6 +38,9 @@ from hvs_suite.policies.belief.residual import RESIDUAL_SIZE, SHIFT, Residual, g
 
 N_JOINTS = 7
 ACTION_UNITS = 2.0**20
+OUT_BOUNDS = (6.0, 8.0, 6.0)
+"""Of the correction, its gate and the weights of the proposals. Without them a head that is right
+nearly always grows so sure that what it should learn of the rest changes nothing any more."""
 HEIGHTS_M = (0.0, 0.05, 0.15)
 """Above the goal, along its normal: the plain postures that the head is shown."""
 RECENT_SIZE = 4
@@ -399,8 +402,13 @@ class BeliefNetwork(nn.Module):
             ways.append(torch.asinh(step / scale))
         said = [torch.asinh(p / scale) for p in proposals]
         out = self.head(torch.cat([inputs, *ways, *said], dim=1))
-        correction, is_corrected, weights = out.split([N_JOINTS, 1, len(proposals)], dim=1)
-        # Weights and gate can become whole: near the goal one proposal is right as it is.
+        correction, is_corrected, weights = (
+            bound * torch.tanh(part / bound)
+            for part, bound in zip(
+                out.split([N_JOINTS, 1, len(proposals)], dim=1), OUT_BOUNDS, strict=True
+            )
+        )
+        # Weights and gate can become nearly whole: near the goal one proposal is right as it is.
         mean = (weights.softmax(dim=1)[:, :, None] * torch.stack(proposals, dim=1)).sum(dim=1)
         total = torch.asinh(mean / scale) + torch.sigmoid(is_corrected) * correction
         return total
