@@ -46,7 +46,7 @@ def act(
     if network.residual is not None:
         memory, read = network.feel(memory, sightings, state, felt)
         memory = network.move_goal(memory, network.residual(read))
-    action = network.to_action(network.decide(memory, sightings, state, felt), memory)
+    action = network.to_action(network.decide(memory, sightings, state, felt).out, memory)
     return action, network.commanded(memory, action)
 
 
@@ -218,7 +218,7 @@ class _Responds(nn.Module):
         network, shape = self._network, self._network.shape
         seen = dict(zip(shape.cameras, sightings, strict=True))
         memory = network.move_goal(memory, share)
-        out = network.decide(memory, seen, state, felt if shape.n_felt else None)
+        out = network.decide(memory, seen, state, felt if shape.n_felt else None).out
         action = network.to_action(out, memory)
         return action, network.commanded(memory, action)
 

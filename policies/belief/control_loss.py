@@ -5,10 +5,13 @@ import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
 from hvs_suite.policies.belief import arm, geometry
-from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
+from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork, Decision
 
 HUBER_BETA = 0.3
 TIP_WEIGHT = 0.3
+CHOICE_WEIGHT = 0.1
+CHOICE_SCALE = 0.1
+"""Mean error of a joint, as it is encoded, by which a proposal is e times less likely."""
 LEVER_M = 0.2
 """Angles weigh like the offsets that they cause so far away."""
 
@@ -16,6 +19,20 @@ LEVER_M = 0.2
 def action_loss(out: Tensor, label: Tensor) -> Tensor:
     """Huber loss between the head's output and the encoded label, both (n, 7)."""
     return F.smooth_l1_loss(out, label, beta=HUBER_BETA)
+
+
+def choice_loss(decision: Decision, label: Tensor) -> Tensor:
+    """How unlikely the label is where each proposal is as likely as the head weighs it.
+
+    The loss of a mean hardly says which proposal would have been right once the head is sure of
+    another one. This one says it all the more.
+
+    Args:
+        decision: Of n frames.
+        label: What the head should have said, (n, 7).
+    """
+    misses = (decision.proposals.detach() - label[:, None]).abs().mean(dim=2) / CHOICE_SCALE
+    return -torch.logsumexp(decision.weights.log_softmax(dim=1) - misses, dim=1).mean()
 
 
 def tip_loss(network: BeliefNetwork, out: Tensor, label: Tensor, q: Tensor, goal: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hvs_suite.policies.belief import geometry
 from hvs_suite.policies.belief.belief import BELIEF_SIZE, View, belief_loss
-from hvs_suite.policies.belief.control_loss import TIP_WEIGHT, action_loss, tip_loss
+from hvs_suite.policies.belief.control_loss import CHOICE_WEIGHT, TIP_WEIGHT, action_loss, choice_loss, tip_loss
 from hvs_suite.policies.belief.eye import sighting_loss
 from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
 from hvs_suite.policies.belief.recorded import Recorded
@@ -110,15 +110,16 @@ def window_lesson(network: BeliefNetwork, window: Window) -> tuple[Tensor, Parts
         normal[:, :2] / normal[:, 2:],
         network.shape.error_scale,
     )
-    out = network.decide(
+    decision = network.decide(
         memory,
         {name: sighting[counts] for name, sighting in window.sightings.items()},
         state,
         None if window.felt is None else window.felt[counts],
     )
     label = network.encode_label(window.action[counts], memory)
-    action = action_loss(out, label)
-    astray = tip_loss(network, out, label, state, truth.goal_position)
-    parts = {"action_loss": action, "tip_loss": astray}
+    action = action_loss(decision.out, label)
+    astray = tip_loss(network, decision.out, label, state, truth.goal_position)
+    choice = choice_loss(decision, label)
+    parts = {"action_loss": action, "tip_loss": astray, "choice_loss": choice}
     parts |= {f"belief_{name}_loss": part.float() for name, part in of_belief.items()}
-    return action + TIP_WEIGHT * astray + believed.float(), parts
+    return action + TIP_WEIGHT * astray + CHOICE_WEIGHT * choice + believed.float(), parts

@@ -125,6 +125,21 @@ class _Place:
     normal: Tensor
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Decision:
+    """What the head makes of an observation; joint steps are encoded (see `to_step`).
+
+    Attributes:
+        out: The joint step from the set point, (B, 7).
+        proposals: Those that it weighed, (B, k, 7).
+        weights: Logits of theirs, (B, k).
+    """
+
+    out: Tensor
+    proposals: Tensor
+    weights: Tensor
+
+
 class BeliefNetwork(nn.Module):
     """Eyes, belief and head.
 
@@ -358,8 +373,8 @@ class BeliefNetwork(nn.Module):
         sightings: Mapping[str, Tensor],
         state: Tensor,
         felt: Tensor | None = None,
-    ) -> Tensor:
-        """What to do: a joint step from the set point, as the head says it, (B, 7).
+    ) -> Decision:
+        """What to do.
 
         Args:
             memory: (B, k), with this observation in it.
@@ -411,7 +426,7 @@ class BeliefNetwork(nn.Module):
         # Weights and gate can become nearly whole: near the goal one proposal is right as it is.
         mean = (weights.softmax(dim=1)[:, :, None] * torch.stack(proposals, dim=1)).sum(dim=1)
         total = torch.asinh(mean / scale) + torch.sigmoid(is_corrected) * correction
-        return total
+        return Decision(total, torch.stack(said, dim=1), weights)
 
     def _moving(self, memory: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Joints (B, 7) rad and their velocities (rad/s) when the next action takes effect."""

@@ -14,6 +14,7 @@ from hvs_suite.errors import DatasetError
 from hvs_suite.policies.imitation.frame_cache import Frames, OnFrames, cached_frames, read_rows
 from hvs_suite.policies.training.dataset import EPISODE, Column, Manifest, read_columns
 
+ROUNDS_SHARE = 0.5
 # Held out from training to measure the loss on; whole episodes, so that no neighbour frame leaks.
 HELD_OUT_SHARE = 0.05
 # Philox words that keep this stream apart from the training order.
@@ -161,8 +162,16 @@ class Demonstrations:
             batch[key] = images.permute(0, 3, 1, 2)
         return batch
 
-    @property
-    def episodes_to_learn_from(self) -> npt.NDArray[np.bool_]:
-        """Of all episodes, those whose frames are to be learned from, (n,)."""
-        begins, _ = self.episodes()
-        return np.isin(begins, self.training)
+    def weights(self) -> npt.NDArray[np.float64]:
+        """How often to draw from each episode, (n,), in sum 1.
+
+        Each frame to be learned from as often as another, but for those of rounds: what happened
+        to the policy itself is a small part of all frames, and half of what is drawn.
+        """
+        begins, lengths = self.episodes()
+        weights = np.where(np.isin(begins, self.training), lengths, 0) / 1.0
+        demonstrated = begins < len(self._recordings[0].columns[EPISODE])
+        if not demonstrated.all():
+            weights[demonstrated] *= (1.0 - ROUNDS_SHARE) / weights[demonstrated].sum()
+            weights[~demonstrated] *= ROUNDS_SHARE / weights[~demonstrated].sum()
+        return weights / weights.sum()

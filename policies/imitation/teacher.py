@@ -126,7 +126,7 @@ class Teacher:
             key = np.random.Philox(key=[self._settings.seed, WINDOW_STREAM], counter=step)
             window = self._windows.draw(
                 self.policy.network,
-                self.demonstrations.episodes_to_learn_from,
+                self.demonstrations.weights(),
                 self._settings.windows,
                 self._settings.window_steps,
                 np.random.Generator(key),

@@ -118,22 +118,21 @@ class WindowPool:
     def draw(
         self,
         network: BeliefNetwork,
-        episodes: npt.NDArray[np.bool_],
+        weights: npt.NDArray[np.float64],
         n: int,
         length: int,
         random: np.random.Generator,
     ) -> Window:
-        """Draw windows, each frame as often as another; those of short episodes begin with them.
+        """Draw windows; those of short episodes begin with them.
 
         Args:
             network: What is to learn from them.
-            episodes: Which may be drawn, (number of episodes,).
+            weights: How often each episode is drawn, (number of episodes,), in sum 1.
             n: How many.
             length: Of each, in control steps.
             random: Draws them, and the jitter.
         """
-        weights = np.where(episodes, self._lengths, 0).astype(np.float64)
-        chosen = random.choice(len(weights), n, p=weights / weights.sum())
+        chosen = random.choice(len(weights), n, p=weights)
         # From a quarter of a window before the beginning, so that it is met often.
         room = self._lengths[chosen] - length // 2
         begins = random.uniform(-0.25 * length, np.maximum(room, 1)).astype(np.int64)
