@@ -39,6 +39,7 @@ from hvs_suite.policies.network.geometry import FlangeMotion
 
 N_JOINTS = 7
 ACTION_UNITS = 2.0**20
+"""Actions are multiples of one part of these; so the action log keeps them in little space."""
 HEIGHTS_M = (0.0, 0.05, 0.15)
 """Above the goal, along its normal: the plain postures that the head is shown."""
 RECENT_SIZE = 4
