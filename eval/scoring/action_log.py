@@ -25,7 +25,9 @@ MOST_BYTES = 64 * 2**20
 MOST_SCENARIOS = 100_000
 _ACTION_SIZE = 7
 _UNITS = 2.0**20
+"""Of `changes`: parts of the range of an action."""
 _MOST_UNITS = 2**28
+"""Actions up to 256; twice the change between two of them still fits 32 bits."""
 _SAME = 1e-4
 """Actions this close are the same: a thousand roundings apart, and a hundredth of a millimetre."""
 _SAME_STEPS = 0.7

@@ -38,6 +38,7 @@ from hvs_suite.policies.belief.residual import RESIDUAL_SIZE, SHIFT, Residual, g
 
 N_JOINTS = 7
 ACTION_UNITS = 2.0**20
+"""Actions are multiples of one part of these; so the action log keeps them in little space."""
 OUT_BOUNDS = (6.0, 8.0, 6.0)
 """Of the correction, its gate and the weights of the proposals. Without them a head that is right
 nearly always grows so sure that what it should learn of the rest changes nothing any more."""
