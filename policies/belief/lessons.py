@@ -12,7 +12,13 @@ from torch import Tensor
 
 from hvs_suite.policies.belief import geometry
 from hvs_suite.policies.belief.belief import BELIEF_SIZE, View, belief_loss
-from hvs_suite.policies.belief.control_loss import CHOICE_WEIGHT, TIP_WEIGHT, action_loss, choice_loss, tip_loss
+from hvs_suite.policies.belief.control_loss import (
+    CHOICE_WEIGHT,
+    TIP_WEIGHT,
+    action_loss,
+    choice_loss,
+    tip_loss,
+)
 from hvs_suite.policies.belief.eye import sighting_loss
 from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
 from hvs_suite.policies.belief.recorded import Recorded
