@@ -40,6 +40,8 @@ class Reproduce:
             record.append("--resume")
         episodes = self.episodes or EPISODES.get(self.task, TEST_SCENARIOS)
         stages = {"record": record}
+        if plan.eyes is not None:
+            stages["eyes"] = list(plan.eyes)
         results: dict[str, Path] = {}
         for name, train in (("pretrained", plan.pretrain), ("fine-tuned", plan.finetune)):
             if train is None:

@@ -23,6 +23,12 @@ def test_a_recipe_trains_on_what_it_records(task):
     assert record.task == plan.task == trained_on(task)
     assert pretrain.data == record.out
     assert pretrain.steps
+    if plan.eyes is not None:
+        eyes = parse(plan.eyes)
+        assert eyes.data == record.out
+        assert str(eyes.out) == pretrain.eyes
+    elif pretrain.eyes is not None:
+        assert (HERE / "pretrained" / pretrain.eyes).is_dir()
     if plan.finetune is not None:
         finetune = parse(plan.finetune)
         assert (Path(finetune.policy), finetune.task) == (pretrain.out, plan.task)
