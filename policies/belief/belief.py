@@ -264,7 +264,7 @@ class Belief(nn.Module):
         across_var = ((angle**2 + log_floors[0].exp() ** 2) * depth**2) * loud[:, :1]
         across_var = across_var + log_floors[1].exp() ** 2
         along_var = share_var * look.by_size**2 + log_floors[1].exp() ** 2
-        there = torch.sigmoid(s[:, VISIBLE] + gate[:, 3:])
+        there = torch.sigmoid(2.0 * (s[:, VISIBLE] + torch.tanh(gate[:, 3:])))
         outer = d[:, :, None] * d[:, None]
         eye3 = torch.eye(3, dtype=P.dtype)
         info = (eye3 - outer) / across_var[:, :, None] + outer / along_var[:, :, None]
@@ -281,7 +281,7 @@ class Belief(nn.Module):
         floor = self.log_floors[i, 3].double().exp()
         variance = s[:, LOG_SIGMA_SLOPE].clamp(-7.0, 2.0).exp() ** 2 + floor**2
         variance = variance * torch.exp(4.0 * torch.tanh(gate[:, 2:3] / 2.0))
-        there = torch.sigmoid(s[:, VISIBLE] + gate[:, 3:]) * (up > 0.2)
+        there = torch.sigmoid(2.0 * (s[:, VISIBLE] + torch.tanh(gate[:, 3:]))) * (up > 0.2)
         return slope, variance / (there**2 + 1e-9)
 
     def normal(self, belief: Tensor) -> Tensor:
