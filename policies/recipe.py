@@ -20,9 +20,15 @@ HERE = Path(__file__).resolve().parent
 DATASET_RECIPES = HERE.parent / "datasets" / "recipes"
 
 SHARED: Mapping[str, str] = MappingProxyType(
-    {"align-fixed": "align-thesis", "align-easy": "align-thesis"}
+    {
+        "align-fixed": "align-thesis",
+        "align-easy": "align-thesis",
+        "insert-feel": "insert-wide",
+        "track-line": "track-curve",
+    }
 )
-"""Tasks that the policy of another task plays: the same scenes, wider tolerances."""
+"""Tasks that the policy of another task plays: the same pictures of the same target, and what is
+asked is known from the other (on insert-feel, all but the search for the hole)."""
 
 
 @dataclasses.dataclass(frozen=True)
