@@ -23,12 +23,11 @@ SHARED: Mapping[str, str] = MappingProxyType(
     {
         "align-fixed": "align-thesis",
         "align-easy": "align-thesis",
-        "insert-feel": "insert-wide",
         "track-line": "track-curve",
     }
 )
-"""Tasks that the policy of another task plays: the same pictures of the same target, and what is
-asked is known from the other (on insert-feel, all but the search for the hole)."""
+"""Tasks that the policy of another task plays: the same pictures of the same target, and nothing is
+asked that the other does not ask."""
 
 
 @dataclasses.dataclass(frozen=True)
