@@ -9,6 +9,7 @@ from hvs_suite.cli.main import parse, run
 from hvs_suite.policies.recipe import HERE, recipe, trained_on
 
 RECIPES = {path.stem for path in (HERE / "recipes").iterdir()}
+NOT_SHIPPED = [task for task in hvs_suite.TASKS if trained_on(task) not in RECIPES]
 
 
 def test_weights_are_shipped_with_a_recipe_each():
@@ -48,7 +49,7 @@ def test_a_shared_policy_sees_what_its_own_task_shows(task):
     [
         ["--task", "align-nothing"],
         ["--task", "align-easy", "--episodes", "0"],
-        ["--task", "track-line"],
+        *(["--task", task] for task in NOT_SHIPPED[:1]),
     ],
 )
 def test_nonsense_is_one_line(words, capsys, tmp_path, monkeypatch):
