@@ -112,6 +112,17 @@ def test_what_is_not_seen_changes_nothing() -> None:
     assert now[0, COVARIANCE][0] > 0.8 * start[0, COVARIANCE][0]
 
 
+def test_forty_sightings_of_what_is_not_in_view_do_not_make_a_place_sure() -> None:
+    belief = make_belief()
+    # Whatever the filter's network has learned to make of them.
+    torch.nn.init.constant_(belief.gate[-1].bias[3:4], 10.0)
+    n = 40
+    now = after(belief, [from_above((0.0, 0.0, 0.5))] * n, [(0.2, 0.1, 0.0)] * n, visible=-5.0)
+    start = belief.start(1)
+    np.testing.assert_allclose(now[0, PLACE], start[0, PLACE], atol=0.03)
+    assert now[0, COVARIANCE][0] > 0.8 * start[0, COVARIANCE][0]
+
+
 def test_more_looks_are_surer_and_a_sure_eye_counts_for_more() -> None:
     view = from_above((0.0, 0.0, 0.5))
     target = (0.1, 0.1, 0.0)
