@@ -148,7 +148,7 @@ def test_an_axis_is_found_by_its_name_or_refused() -> None:
         (["--policy", "servant", "--task", "align-thesis"], "did you mean servo"),
         (["--policy", "servo", "--task", "align-thesys"], "align-thesis"),
         (["--policy", "servo", "--task", "clutter-choice", "--axis", "marker"], "no axis marker"),
-        (["--policy", "pretrained", "--task", "track-line"], "no pretrained weights"),
+        (["--policy", "finetuned", "--task", "align-easy"], "no finetuned weights"),
         (["--policy", "zero", "--task", "align-thesis", "--episodes", "0"], "at least 1"),
         (["--policy", "zero", "--task", "align-easy", "--beside", "{folder}/x.json"], "x.json"),
     ],
