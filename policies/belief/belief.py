@@ -45,6 +45,7 @@ GATES_A_CAMERA = 4
 GATES = 4
 """Of all cameras: forgetting, and how much place, motion and slope may have changed."""
 CHANGE_SLOPE = 3.0
+"""By which the gates of change are multiplied, so that noises are learned three times as fast."""
 FORGET_SLOPE = 5.0
 FORGET_AT = 3.2
 """A share of 1e-7 is forgotten where the gate says 0: of half a metre, a tenth of a millimetre."""
