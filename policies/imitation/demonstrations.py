@@ -14,6 +14,7 @@ from hvs_suite.errors import DatasetError
 from hvs_suite.policies.imitation.frame_cache import Frames, OnFrames, cached_frames, read_rows
 from hvs_suite.policies.training.dataset import EPISODE, Column, Manifest, read_columns
 
+# Of the windows, once there are rounds of DAgger, which are a small part of all frames.
 ROUNDS_SHARE = 0.5
 # Held out from training to measure the loss on; whole episodes, so that no neighbour frame leaks.
 HELD_OUT_SHARE = 0.05

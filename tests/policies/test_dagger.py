@@ -86,6 +86,10 @@ def test_added_frames_are_learned_from_and_never_held_out(data, novice, tmp_path
     demonstrations.add(found[1])
     assert len(demonstrations.training) == before + FRAMES
     np.testing.assert_array_equal(demonstrations.held_out, held_out)
+    weights = demonstrations.weights()
+    begins, _ = demonstrations.episodes()
+    assert weights[begins >= len(miniature.scene(40)["action"])].sum() == pytest.approx(0.5)
+    assert not weights[np.isin(begins, held_out)].any()
     batch = demonstrations.batch(np.array([3, 40, 69]))
     np.testing.assert_array_equal(batch["action"][1:], found[1].columns["action"][[0, 29]])
     np.testing.assert_array_equal(batch["action"][0], miniature.scene(40)["action"][3])
