@@ -155,31 +155,38 @@ def way_to_posture(q: Tensor, flange: Tensor, normal: Tensor) -> tuple[Tensor, T
     return ways[row, nearer], times[row, nearer, None], within[row, nearer, None].to(q)
 
 
-def along_way(turns: Tensor, velocity: Tensor, time_s: float) -> Tensor:
-    """How far joints have come after some time on the fastest way to rest, all arriving together.
+def along_way(
+    turns: Tensor, velocity: Tensor, time_s: float, *, together: bool = True
+) -> Tensor:
+    """How far joints have come after some time on the fastest way to rest.
 
-    The slowest joint decides when. The others go to a top speed p from which they arrive then, at
-    the full acceleration a: with x to go in the direction in which they have to brake last, u their
-    speed in it and t the time, p^2 - (u + a t) p + a x + u^2 / 2 = 0; where that p would be below
-    u, they slow down to p = (x - u^2 / (2 a)) / (t - u / a) at once. The planner's ruckig does the
-    same with more than nine joints of ten, and lets some that have too much time brake more evenly.
+    Each arrives as soon as it can, or all arrive with the slowest. Then the others go to a top
+    speed p from which they arrive at that time, at the full acceleration a: with x to go in the
+    direction in which they have to brake last, u their speed in it and t the time,
+    p^2 - (u + a t) p + a x + u^2 / 2 = 0; where that p would be below u, they slow down to
+    p = (x - u^2 / (2 a)) / (t - u / a) at once. The planner's ruckig does the same with more than
+    nine joints of ten, and lets some that have too much time brake more evenly.
 
     Args:
-        turns: That are left of A1 to A6, (B, 6) rad.
-        velocity: Of these joints, (B, 6) rad/s.
+        turns: That are left of the first n joints, (B, n) rad.
+        velocity: Of these joints, (B, n) rad/s.
         time_s: After which (s).
+        together: Whether all arrive together, or each as soon as it can.
 
     Returns:
-        (B, 6) rad.
+        (B, n) rad.
     """
-    w = torch.as_tensor(JOINT_SPEED_RAD_S[:-1]).to(turns)
-    a = torch.as_tensor(JOINT_ACCELERATION_RAD_S2[:-1]).to(turns)
+    n = turns.shape[1]
+    w = torch.as_tensor(JOINT_SPEED_RAD_S[:n]).to(turns)
+    a = torch.as_tensor(JOINT_ACCELERATION_RAD_S2[:n]).to(turns)
     v = torch.maximum(torch.minimum(velocity, w), -w)
     side = torch.where(turns >= v * v.abs() / (2.0 * a), 1.0, -1.0)
     x, u = side * turns, side * v
     highest = torch.sqrt((a * x + 0.5 * u**2).clamp(min=0.0))
     cruising = (2.0 * w - u) / a + (x - (2.0 * w**2 - u**2) / (2.0 * a)) / w
-    t = torch.where(highest <= w, (2.0 * highest - u) / a, cruising).amax(dim=1, keepdim=True)
+    t = torch.where(highest <= w, (2.0 * highest - u) / a, cruising)
+    if together:
+        t = t.amax(dim=1, keepdim=True)
     both = u + a * t
     faster = 0.5 * (both - torch.sqrt((both**2 - 4.0 * a * x - 2.0 * u**2).clamp(min=0.0)))
     slower = (x - u**2 / (2.0 * a)) / (t - u / a).clamp(min=1e-6)

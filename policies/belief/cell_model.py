@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from hvs_suite.cell.cameras import look_at
+from hvs_suite.datasets.looking import LOOK_OUT_RAD
 from hvs_suite.datasets.planner import LEAD_S
 from hvs_suite.policies.belief.network import CellModel
 from hvs_suite.tasks.shared.spec import Spec
@@ -33,4 +34,5 @@ def cell_model(spec: Spec) -> CellModel:
         eth_rotation=tuple(map(tuple, eth.tolist())),
         eih_origin=tuple(place.tolist()),
         eih_rotation=tuple(map(tuple, axes.tolist())),
+        look_out_rad=tuple(LOOK_OUT_RAD.tolist()),
     )

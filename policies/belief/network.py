@@ -5,9 +5,10 @@ task is (where targets lie, how large they are, how far off the tool stays, what
 learns from demonstrations.
 
 The head thinks in the goal's frame first: a small network says to which point by the goal the tip
-should go next, damped least squares turn that into a joint step, the ways to two plain postures
-over the goal are put beside it, and a second network weighs them and corrects their mean, on a
-logarithmic scale on which a micrometre and a metre both teach something.
+should go next, damped least squares turn that into a joint step. The ways to two plain postures
+over the goal, and to one from which the cameras see more, are put beside it. A second network
+weighs them and corrects their mean, on a logarithmic scale on which a micrometre and a metre both
+teach something.
 """
 
 import dataclasses
@@ -63,6 +64,8 @@ class CellModel:
         eth_rotation: Its optical axes as columns, (3, 3).
         eih_origin: Place of the eye in the hand in the flange frame, (3,) m.
         eih_rotation: Its optical axes there as columns, (3, 3).
+        look_out_rad: Posture in which the arm hides nothing from the eye to hand, (7,) rad; None
+            for a head that is not shown the way there.
     """
 
     period_s: float
@@ -74,6 +77,7 @@ class CellModel:
     eth_rotation: tuple[tuple[float, ...], ...]
     eih_origin: tuple[float, ...]
     eih_rotation: tuple[tuple[float, ...], ...]
+    look_out_rad: tuple[float, ...] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -193,8 +197,12 @@ class BeliefNetwork(nn.Module):
         )
         self.lead_s = nn.Parameter(torch.tensor(0.1))
         self.feedback = nn.Parameter(torch.zeros(2))
-        full = width + way_width + N_JOINTS * (1 + n_ways)
-        last = nn.Linear(hidden, N_JOINTS + 1 + 1 + n_ways)
+        n_proposals = 1 + n_ways
+        if cell.look_out_rad is not None:
+            n_proposals += 1
+            way_width += 2 * N_JOINTS
+        full = width + way_width + N_JOINTS * n_proposals
+        last = nn.Linear(hidden, N_JOINTS + 1 + n_proposals)
         with torch.no_grad():
             last.weight.mul_(0.1)
             last.bias.zero_()
@@ -407,15 +415,21 @@ class BeliefNetwork(nn.Module):
         joints, velocity = self._moving(memory, state)
         ways = []
         tool = self.cell.tool_length_m
+        ahead_s = self.cell.period_s + self.cell.lead_s
         for height in HEIGHTS_M:
             over = (ahead + (height + tool) * normal).detach()
             turns, time_s, within = arm.way_to_posture(joints, over, normal.detach())
-            ahead_s = self.cell.period_s + self.cell.lead_s
             gone = arm.along_way(turns, velocity[:, :-1], ahead_s)
             step = gone + (joints - set_point)[:, :-1]
             proposals.append(F.pad(step, (0, 1)))
             ways += [torch.asinh(turns / scale), time_s, within]
             ways.append(torch.asinh(step / scale))
+        if self.cell.look_out_rad is not None:
+            turns = joints.new_tensor(self.cell.look_out_rad) - joints
+            gone = arm.along_way(turns, velocity, ahead_s, together=False)
+            step = gone + joints - set_point
+            proposals.append(step)
+            ways += [torch.asinh(turns / scale), torch.asinh(step / scale)]
         said = [torch.asinh(p / scale) for p in proposals]
         out = self.head(torch.cat([inputs, *ways, *said], dim=1))
         correction, is_corrected, weights = (

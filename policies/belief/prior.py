@@ -11,9 +11,9 @@ from hvs_suite.datasets.features import STATE
 from hvs_suite.policies.belief.belief import ACCELERATION, N_MOTION, PLACE, VELOCITY, Prior, View
 from hvs_suite.policies.belief.geometry import flange_motion
 from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
+from hvs_suite.policies.belief.recorded import shown_goals
 from hvs_suite.policies.training.dataset import (
     EPISODE,
-    GOAL_NORMAL,
     GOAL_POSITION,
     GOAL_VELOCITY,
     TARGET_PREFIX,
@@ -49,16 +49,16 @@ def fit_prior(
 
     Args:
         columns: ``privileged.goal_position`` and ``privileged.goal_normal`` (n, 3),
-            ``privileged.target_<camera>`` (n, 4) of each camera of the views,
-            ``episode_index`` (n,), and ``privileged.goal_velocity`` (n, 3), without which goals
-            stand still.
+            ``observation.state`` (n, 14), ``privileged.target_<camera>`` (n, 4) of each camera of
+            the views, ``episode_index`` (n,), and those of
+            `hvs_suite.policies.belief.recorded.FURTHER_KEYS` that there are.
         views: Camera name to its pose at each frame, nominal.
         period_s: Control period (s).
 
     Returns:
         The prior.
     """
-    goal, normal = _double(columns[GOAL_POSITION]), _double(columns[GOAL_NORMAL])
+    goal, normal = (_double(part) for part in shown_goals(columns))
     velocity = (
         _double(columns[GOAL_VELOCITY]) if GOAL_VELOCITY in columns else torch.zeros_like(goal)
     )
@@ -92,7 +92,7 @@ def take_prior(network: BeliefNetwork, columns: Mapping[str, npt.NDArray[np.gene
 
     Args:
         network: Gets it: the prior of its belief, and how low goals lie.
-        columns: As in `fit_prior`, and ``observation.state`` (n, 14).
+        columns: As in `fit_prior`.
     """
     views = network.views(flange_motion(_double(columns[STATE])[:, :N_JOINTS]))
     prior = fit_prior(columns, views, network.cell.period_s)

@@ -10,16 +10,21 @@ from torch import Tensor
 
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, set_point_after
 from hvs_suite.datasets.features import ACTION_EXECUTED, STATE
+from hvs_suite.policies.belief.geometry import flange_motion
 from hvs_suite.policies.belief.network import N_JOINTS
 from hvs_suite.policies.training.dataset import (
     EPISODE,
     GOAL_NORMAL,
     GOAL_POSITION,
     GOAL_VELOCITY,
+    JOINT_OFFSET,
     TARGET_PREFIX,
 )
 
 Column = npt.NDArray[np.generic]
+
+FURTHER_KEYS = (GOAL_VELOCITY, JOINT_OFFSET)
+"""Columns that only some tasks have: elsewhere goals stand still, and encoders are right."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -28,7 +33,7 @@ class Recorded:
 
     Attributes:
         set_point: Where the arm has been sent when the frame is seen, (..., 7) rad.
-        goal_position: Of the tip at the goal, (..., 3) m.
+        goal_position: Of the tip at the goal, as the encoders show it, (..., 3) m.
         goal_normal: Unit normal there, (..., 3).
         goal_velocity: (..., 3) m/s.
         targets: Camera name to u, v, apparent diameter in image widths and 1 where it can be seen,
@@ -67,7 +72,7 @@ class Recorded:
 
 
 def recorded_keys(cameras: tuple[str, ...]) -> list[str]:
-    """Columns that `recorded` needs, but for the goal's velocity, which stands still without.
+    """Columns that `recorded` needs, whatever the task; `FURTHER_KEYS` says what else it reads.
 
     Args:
         cameras: Names of the policy's cameras.
@@ -86,23 +91,52 @@ def recorded(columns: Mapping[str, Column], cameras: tuple[str, ...], period_s: 
 
     Args:
         columns: Those of `recorded_keys` and ``episode_index``, (n, ...) each, the frames of an
-            episode in order; ``privileged.goal_velocity`` where there is one.
+            episode in order; those of `FURTHER_KEYS` that there are.
         cameras: Names of the policy's cameras.
         period_s: Control period (s).
 
     Returns:
         The truth of the n frames, float32.
     """
-    goal = _tensor(columns[GOAL_POSITION])
+    goal, normal = (_tensor(part) for part in shown_goals(columns))
     return Recorded(
         set_point=_tensor(set_points(columns, period_s)),
         goal_position=goal,
-        goal_normal=_tensor(columns[GOAL_NORMAL]),
+        goal_normal=normal,
         goal_velocity=_tensor(columns[GOAL_VELOCITY])
         if GOAL_VELOCITY in columns
         else torch.zeros_like(goal),
         targets={name: _tensor(columns[TARGET_PREFIX + name]) for name in cameras},
     )
+
+
+def shown_goals(
+    columns: Mapping[str, Column],
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """The goals where a robot that believes its encoders sees them.
+
+    With zero errors of the encoders, the flange is elsewhere than the measured joints say, and all
+    that the eye in the hand sees is off with it. The arm is sent in the same wrong angles. So what
+    a policy can see, and where it has to go, is the goal as it lies by the true flange, put by the
+    flange that the encoders show: with T the pose of the flange, T(shown) T(true)^-1 goal.
+
+    Args:
+        columns: State, goal and normal, (n, ...) each, and ``privileged.joint_offset`` (n, 7) rad,
+            measured less true angles, if there is any.
+
+    Returns:
+        Goals (n, 3) m and unit normals (n, 3).
+    """
+    goal, normal = (np.asarray(columns[key], np.float64) for key in (GOAL_POSITION, GOAL_NORMAL))
+    if JOINT_OFFSET not in columns:
+        return goal, normal
+    q = np.asarray(columns[STATE], np.float64)[:, :N_JOINTS]
+    shown = flange_motion(torch.from_numpy(q))
+    true = flange_motion(torch.from_numpy(q - np.asarray(columns[JOINT_OFFSET], np.float64)))
+    turn = (shown.rotation @ true.rotation.transpose(1, 2)).numpy()
+    offset = goal - true.position.numpy()
+    position = shown.position.numpy() + np.einsum("nij,nj->ni", turn, offset)
+    return position, np.einsum("nij,nj->ni", turn, normal)
 
 
 def set_points(columns: Mapping[str, Column], period_s: float) -> npt.NDArray[np.float64]:

@@ -25,6 +25,7 @@ Width = Annotated[int, pydantic.Field(strict=True, ge=4, le=_MOST_SIZE)]
 Coordinate = Annotated[float, pydantic.Field(strict=True, ge=-10.0, le=10.0)]
 Cosine = Annotated[float, pydantic.Field(strict=True, ge=-1.0 - 1e-9, le=1.0 + 1e-9)]
 Tangent = Annotated[float, pydantic.Field(strict=True, ge=0.01, le=100.0)]
+Angle = Annotated[float, pydantic.Field(strict=True, ge=-4.0, le=4.0)]
 Period = Annotated[float, pydantic.Field(strict=True, ge=1e-3, le=10.0)]
 StepLength = Annotated[float, pydantic.Field(strict=True, gt=0.0, le=0.1)]
 Place = tuple[Coordinate, Coordinate, Coordinate]
@@ -46,6 +47,7 @@ class Cell(pydantic.BaseModel):
     eth_rotation: Axes
     eih_origin: Place
     eih_rotation: Axes
+    look_out_rad: tuple[Angle, Angle, Angle, Angle, Angle, Angle, Angle] | None = None
 
     @pydantic.field_validator("eth_rotation", "eih_rotation")
     @classmethod

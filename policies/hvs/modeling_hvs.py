@@ -15,13 +15,12 @@ from hvs_suite.policies.belief.eye import SIGHTING_SIZE
 from hvs_suite.policies.belief.lessons import Window, eye_lesson, window_lesson
 from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
 from hvs_suite.policies.belief.prior import take_prior
-from hvs_suite.policies.belief.recorded import Recorded, recorded, recorded_keys
+from hvs_suite.policies.belief.recorded import FURTHER_KEYS, Recorded, recorded, recorded_keys
 from hvs_suite.policies.belief.settings import as_numbers
 from hvs_suite.policies.hvs.configuration_hvs import HvsConfig
 from hvs_suite.policies.trained_for import trained_for
 from hvs_suite.policies.training.checkpoint import write_checkpoint
 from hvs_suite.policies.training.dataset import (
-    GOAL_VELOCITY,
     Manifest,
     read_columns,
     read_manifest,
@@ -68,7 +67,7 @@ class HvsPolicy(PreTrainedPolicy):
 
     def _learn_of(self, manifest: Manifest, *, with_prior: bool) -> None:
         cameras, period_s = tuple(self.network.shape.cameras), self.config.control_period_s
-        further = [GOAL_VELOCITY] if GOAL_VELOCITY in manifest.features else []
+        further = [key for key in FURTHER_KEYS if key in manifest.features]
         columns = read_columns(manifest, [*recorded_keys(cameras), *further])
         self._recorded = recorded(columns, cameras, period_s)
         if with_prior:

@@ -29,6 +29,7 @@ EPISODE = "episode_index"
 GOAL_POSITION = "privileged.goal_position"
 GOAL_NORMAL = "privileged.goal_normal"
 GOAL_VELOCITY = "privileged.goal_velocity"
+JOINT_OFFSET = "privileged.joint_offset"
 TARGET_PREFIX = "privileged.target_"
 
 Column = npt.NDArray[Any]
@@ -71,7 +72,8 @@ class Manifest:
     @property
     def trained_keys(self) -> list[str]:
         """The features that training reads: all observations, actions, targets, goal."""
-        wanted = {STATE, ACTION, ACTION_EXECUTED, GOAL_POSITION, GOAL_NORMAL, GOAL_VELOCITY}
+        wanted = {STATE, ACTION, ACTION_EXECUTED, GOAL_POSITION, GOAL_NORMAL}
+        wanted |= {GOAL_VELOCITY, JOINT_OFFSET}
         wanted |= {TARGET_PREFIX + name for name in self.cameras}
         wanted |= {IMAGES + name for name in self.cameras}
         wanted |= {

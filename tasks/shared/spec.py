@@ -352,12 +352,14 @@ class Spec(Timing, Cameras, Disturbances):
     def privileged(self) -> dict[str, tuple[str, ...]]:
         """Vectors that only training may see, with the names of their dimensions.
 
-        The goal, where each keypoint is in each camera's picture (see ``ArmTask.privileged``), and
-        the family's own.
+        The goal, the encoders' zero errors where there are any, where each keypoint is in each
+        camera's picture (see ``ArmTask.privileged``), and the family's own.
         """
+        joints = tuple(f"A{i}" for i in range(1, 8))
         return {
             "goal_position": ("x", "y", "z"),
             "goal_normal": ("x", "y", "z"),
+            **({"joint_offset": joints} if self.joint_offset_deg > 0 else {}),
             **{
                 f"{keypoint}_{camera}": ("u", "v", "diameter", "visible")
                 for keypoint in self.keypoints
