@@ -13,7 +13,7 @@ feature                                   dtype, shape    meaning
 ``privileged.scenario``                   int64 (1,)      index in the split
 ``privileged.goal_position``              float32 (3,)    of the flange at the goal (m, base frame)
 ``privileged.goal_normal``                float32 (3,)    outward surface normal there
-``privileged.joint_offset``               float32 (7,)    encoder zero errors (rad), if there are any
+``privileged.joint_offset``               float32 (7,)    zero errors of the encoders (rad), if any
 ``privileged.<keypoint>_<camera>``        float32 (4,)    in the image: u, v, diameter, seen
 ``privileged.errors``                     float32 (k,)    the task's metrics at this frame
 ========================================  ==============  ========================================

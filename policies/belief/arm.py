@@ -155,9 +155,7 @@ def way_to_posture(q: Tensor, flange: Tensor, normal: Tensor) -> tuple[Tensor, T
     return ways[row, nearer], times[row, nearer, None], within[row, nearer, None].to(q)
 
 
-def along_way(
-    turns: Tensor, velocity: Tensor, time_s: float, *, together: bool = True
-) -> Tensor:
+def along_way(turns: Tensor, velocity: Tensor, time_s: float, *, together: bool = True) -> Tensor:
     """How far joints have come after some time on the fastest way to rest.
 
     Each arrives as soon as it can, or all arrive with the slowest. Then the others go to a top

@@ -94,8 +94,9 @@ def test_a_tip_that_is_high_enough_or_far_beside_is_left_alone() -> None:
     assert (arm.kept_above(q, far, normal, doubt, NOWHERE, 0.0) == q).all()
 
 
+@pytest.mark.parametrize("together", [True, False])
 @pytest.mark.parametrize("time_s", [0.02, 0.125, 0.5])
-def test_joints_on_their_way_are_where_the_planner_has_them(time_s: float) -> None:
+def test_joints_on_their_way_are_where_the_planner_has_them(time_s: float, together: bool) -> None:
     random = np.random.default_rng(2)
     fastest, braking = robot.JOINT_SPEED_RAD_S[:6], robot.JOINT_ACCELERATION_RAD_S2[:6]
     turns = 0.5 * random.normal(size=(300, 6)) ** 3
@@ -104,13 +105,17 @@ def test_joints_on_their_way_are_where_the_planner_has_them(time_s: float) -> No
     plan = ruckig.InputParameter(6)
     plan.max_velocity, plan.max_acceleration = fastest.tolist(), braking.tolist()
     plan.current_position = [0.0] * 6
+    how = ruckig.Synchronization
+    plan.synchronization = getattr(how, "Time" if together else "No")
     expected = []
     for way, speed in zip(turns, velocity, strict=True):
         plan.target_position, plan.current_velocity = way.tolist(), speed.tolist()
         motion = ruckig.Trajectory(6)
         ruckig.Ruckig(6).calculate(plan, motion)
         expected.append(motion.at_time(min(time_s, motion.duration))[0])
-    found = arm.along_way(torch.from_numpy(turns), torch.from_numpy(velocity), time_s)
+    found = arm.along_way(
+        torch.from_numpy(turns), torch.from_numpy(velocity), time_s, together=together
+    )
     # A joint that has too much time may use it in more than one way.
     off = np.abs(found.numpy() - np.array(expected))
     assert np.quantile(off, 0.9) < 1e-6
