@@ -537,9 +537,10 @@ class BeliefNetwork(nn.Module):
         doubt = doubt.clamp(min=0.0).sqrt()
         lowest = self.lowest_m - arm.BEYOND_M
         target = arm.kept_above(target, goal, normal, doubt, lowest, self.cell.tool_length_m)
-        # Far finer than the arm goes (3 um at the tip), and logs of it are short.
+        # Far finer than the arm goes (3 um at the tip), and logs of it are short, if no zero has a
+        # sign.
         action = (target / self.joint_range).clamp(-1.0, 1.0)
-        return torch.round(action * ACTION_UNITS) / ACTION_UNITS
+        return torch.round(action * ACTION_UNITS) / ACTION_UNITS + 0.0
 
     def _goal(self, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Where the tip is taken to have to go (B, 3) m, and the normal there (B, 3)."""

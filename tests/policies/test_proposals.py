@@ -1,4 +1,4 @@
-"""What the head chooses from: while no camera has seen the target, what the demonstrator does."""
+"""The head: what it chooses from while no camera has seen the target, and what it answers."""
 
 import numpy as np
 import torch
@@ -33,3 +33,12 @@ def test_an_arm_that_sees_nothing_is_shown_the_way_to_where_it_looks_from() -> N
         time_step = env.step(action[0].numpy())
         steps += 1
     assert steps > 3
+
+
+def test_no_zero_has_a_sign_because_logs_are_twice_as_long_with_it() -> None:
+    spec = hvs_suite.load("align-thesis", observations="state").spec
+    network = BeliefNetwork(Shape({"eih": (3, 64)}, hidden=8), cell_model(spec))
+    memory = network.sent_on(network.start(1), torch.full((1, 7), -1e-9, dtype=torch.float64))
+    action = network.to_action(torch.zeros(1, 7), memory)
+    assert (action == 0.0).any()
+    assert not torch.signbit(action[action == 0.0]).any()
