@@ -30,7 +30,7 @@ from hvs_suite.tasks.shared import lock
 from hvs_suite.tasks.shared.scenario import TEST_SCENARIOS, TEST_SPLIT
 from hvs_suite.tasks.shared.spec import Spec
 
-LOGGED_OF_BUILTIN = 25
+LOGGED_OF_BUILTIN = 50
 """Scenarios that the log of a built-in policy holds: it can play the others again."""
 
 Progress = Callable[[Trial], None]
