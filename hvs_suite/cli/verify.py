@@ -64,7 +64,8 @@ class Verify(Players):
                     print(
                         f"{shown(str(path))}: as it says; {verdict.n_played} of "
                         f"{verdict.n_episodes} scenarios played again{drawn}, {verdict.n_near} "
-                        f"decided by rounding, largest difference {_largest(verdict.largest)}"
+                        f"decided by rounding{_otherwise(verdict.n_other)}, largest difference "
+                        f"{_largest(verdict.largest)}"
                     )
         except (ResultError, UnknownTaskError) as error:
             from hvs_suite.cli.main import complain
@@ -74,6 +75,13 @@ class Verify(Players):
         if self.json:
             console.print_json(found)
         return 0
+
+
+def _otherwise(n_other: int) -> str:
+    """In how many scenarios a policy that played again went another way, if in any."""
+    if not n_other:
+        return ""
+    return f", {n_other} played otherwise by the policy on this processor"
 
 
 def _largest(largest: Mapping[str, float]) -> str:

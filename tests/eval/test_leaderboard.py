@@ -633,4 +633,4 @@ def test_the_committed_board_is_what_the_committed_results_give(
 
 def played_well(path: Path) -> verification.Verdict:
     n = result_file.load(path).summary.n_episodes
-    return verification.Verdict(n, min(n, replay_check.SAMPLE), 0, None, {})
+    return verification.Verdict(n, min(n, replay_check.SAMPLE), 0, 0, None, {})

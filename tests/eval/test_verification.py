@@ -4,7 +4,7 @@ import dataclasses
 import io
 import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from hvs_suite.errors import ResultError
 from hvs_suite.eval import protocol
 from hvs_suite.eval.board import clips
 from hvs_suite.eval.scoring import result_file, verification
-from hvs_suite.eval.scoring.result_file import EpisodeRow, Summary
+from hvs_suite.eval.scoring.result_file import EpisodeRow, Result, Summary
 from hvs_suite.eval.scoring.trial import EpisodeLostError, play_trial
 from hvs_suite.eval.studies import failures
 from hvs_suite.policies import builtin
@@ -243,17 +243,37 @@ def partly_logged(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempP
 
 
 def altered(path: Path, folder: Path, scenario: int, policy: str | None = None) -> Path:
-    """A copy in which a scenario ended a hundredth elsewhere, and all else agrees."""
+    """A copy in which a scenario ended a tenth elsewhere, and all else agrees."""
     copied = Path(shutil.copytree(path.parent, folder / "copy")) / path.name
     result = result_file.load(copied)
     rows = list(result.episodes)
-    otherwise = {name: value + 0.01 for name, value in rows[scenario].settled.errors.items()}
+    otherwise = {name: value + 0.1 for name, value in rows[scenario].settled.errors.items()}
     changed: dict[str, Any] = {
         "settled": rows[scenario].settled.model_copy(update={"errors": otherwise})
     }
     if not rows[scenario].success:
         changed["errors"] = otherwise
     rows[scenario] = rows[scenario].model_copy(update=changed)
+    return rewritten(copied, result, rows, policy)
+
+
+def with_lost(path: Path, folder: Path, scenarios: Collection[int]) -> Path:
+    """A copy that says of some scenarios that the time limit came before the goal."""
+    copied = Path(shutil.copytree(path.parent, folder / "copy")) / path.name
+    result = result_file.load(copied)
+    rows = list(result.episodes)
+    for scenario in scenarios:
+        end = rows[scenario].settled
+        lost = {"success": False, "steps_to_goal": None, "truncated": True}
+        lost |= {"steps": end.steps, "errors": end.errors}
+        rows[scenario] = rows[scenario].model_copy(update=lost)
+    return rewritten(copied, result, rows)
+
+
+def rewritten(
+    path: Path, result: Result, rows: list[EpisodeRow], policy: str | None = None
+) -> Path:
+    """The file with other rows, and the summary that they have."""
     said = result.summary
     summary = Summary.of(
         said.task,
@@ -263,8 +283,8 @@ def altered(path: Path, folder: Path, scenario: int, policy: str | None = None) 
         tolerances=result.metadata.tolerances,
         time_limit_steps=result.metadata.time_limit_steps,
     )
-    result_file.write(result.model_copy(update={"episodes": rows, "summary": summary}), copied)
-    return copied
+    result_file.write(result.model_copy(update={"episodes": rows, "summary": summary}), path)
+    return path
 
 
 def test_a_built_in_policy_plays_again_what_is_not_logged(partly_logged: Path) -> None:
@@ -287,6 +307,20 @@ def test_an_altered_row_is_found_whether_it_is_logged_or_not(
     path = altered(partly_logged, tmp_path, scenario)
     with pytest.raises(ResultError, match=f"scenario {scenario}: .*error"):
         verification.verify(path)
+
+
+def test_a_policy_that_looks_may_go_another_way_if_it_solves_as_many(tmp_path: Path) -> None:
+    path = tmp_path / "results" / "servo.json"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(protocol, "LOGGED_OF_BUILTIN", 2)
+        protocol.evaluate("servo", "align-fixed", path, episodes=10)
+    assert verification.verify(path).n_other == 0
+    verdict = verification.verify(altered(path, tmp_path / "elsewhere", 3))
+    assert (verdict.n_played, verdict.n_near, verdict.n_other) == (10, 0, 1)
+    # It solves all eight that are not logged.
+    assert verification.verify(with_lost(path, tmp_path / "seven", range(3, 10))).n_other == 7
+    with pytest.raises(ResultError, match="0 of 8 scenarios that are not logged are claimed"):
+        verification.verify(with_lost(path, tmp_path / "eight", range(2, 10)))
 
 
 @pytest.mark.parametrize("policy", ["trapped:make", "hvs_suite_none", "./expert", "finetuned"])
