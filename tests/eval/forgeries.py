@@ -45,7 +45,7 @@ def with_log(path: Path, log: list[Any], change: Callable[[EpisodeRow], EpisodeR
 
 
 def near_a_bound(folder: Path) -> Path:
-    """Two arms that miss by far, their tilt brought to within 1e-5 deg of its bound in one step."""
+    """Two arms that miss by far; in one step their tilt is brought to a rounding of its bound."""
     path = folder / "results" / "mine" / "align-fixed.json"
     protocol.evaluate("expert", "align-fixed", path, episodes=10)
     log = action_log.load(

@@ -380,8 +380,8 @@ def better_error(content: Content, path: Path) -> None:
     reseal(content)
 
 
-def better_settled_error(content: Content, path: Path) -> None:
-    content["episodes"]["settled"]["errors"]["tilt_error_deg"][1] += 3e-5
+def worse_settled_error(content: Content, path: Path) -> None:
+    content["episodes"]["settled"]["errors"]["tilt_error_deg"][1] += 0.011
     reseal(content)
 
 
@@ -474,7 +474,7 @@ def resealed(name: str, value: Any) -> Callable[[Content, Path], None]:
 
 TAMPERING: dict[str, tuple[Callable[[Content, Path], None], str]] = {
     "a better error, summary and seal made to fit": (better_error, "scenario 1: position_error"),
-    "a settled error, a hair too far": (better_settled_error, "scenario 1: settled.tilt_error"),
+    "a settled error, a hair too far": (worse_settled_error, "scenario 1: settled.tilt_error"),
     "a faster success": (faster, "scenario 0: steps is"),
     "a flattered summary": (edit("summary.pc_success", 99.0), "summary.pc_success is not"),
     "another policy's name": (edit("summary.policy", "mine"), "was changed after it was written"),
