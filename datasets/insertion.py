@@ -43,6 +43,9 @@ FUNNEL_TILT_DEG = 10.0
 FUNNEL_SLOPE = 4.0
 ASIDE_MM = 15.0
 """Largest step towards the axis."""
+PRESS_MM = 3.0
+"""How far below the tip the set point of one that presses gently is: the arm gives 0.2 mm a newton.
+"""
 SETTLED_SHARE = 1.0 / 3.0
 """Of how far off a tip may be and still be caught: so near to the axis it goes into the hole."""
 
@@ -96,6 +99,8 @@ class GuardedInsertion:
         set_point: FloatArray,
         goal: Goal,
         caught_mm: float,
+        *,
+        gently: bool = False,
     ) -> FloatArray:
         """As `next_set_point`, but it changes little where the arm stands a little elsewhere.
 
@@ -109,6 +114,7 @@ class GuardedInsertion:
             set_point: Now, (7,) rad.
             goal: In the hole: its target is the middle of the mouth, its standoff negative.
             caught_mm: How far beside the axis the mouth still catches the tip.
+            gently: Whether the hole may be elsewhere, so that the tip must not press hard.
 
         Returns:
             (7,) rad.
@@ -128,6 +134,8 @@ class GuardedInsertion:
             # Through the mouth within one tolerance, above the gate from two on.
             least += (GATE_MM - least) * min(max(off / within - 1.0, 0.0), 1.0)
             least += min(FUNNEL_SLOPE * max(off - 2.0 * within, 0.0), ABOVE_MM - GATE_MM)
+        if gently and height < GATE_MM:
+            least = max(least, arm[HEIGHT] - PRESS_MM)
         step = min(max(_BRAKING * (height - GATE_MM), SLOW_MM), FAST_MM)
         height = max(height - step, least) if height > least else min(height + FAST_MM, least)
         _, tip = self._kinematics.tip_pose(set_point)

@@ -17,7 +17,8 @@ A target that is suddenly elsewhere counts as a new one that has not been seen.
 And where the arm may start anywhere, it goes there in one of two plain postures (see
 `hvs_suite.datasets.planner.Planner`).
 
-Into a hole it goes down along a funnel (see `hvs_suite.datasets.insertion`).
+Into a hole it goes down along a funnel (see `hvs_suite.datasets.insertion`). Where the hole is not
+where the pictures show it, nobody sees that, so it goes where they show it, and presses gently.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ import numpy.typing as npt
 
 from hvs_suite.datasets.expert import Expert
 from hvs_suite.registry import TASKS
+from hvs_suite.tasks.shared.family import GOAL_UNSEEN
 from hvs_suite.tasks.shared.goal import Goal
 from hvs_suite.tasks.shared.peg_and_bushing import PegSpec
 from hvs_suite.tasks.shared.spec import CAMERA_NAMES
@@ -55,6 +57,7 @@ CLEARANCE_M = 0.03
 """What demonstrations keep from surface, self and obstacles where they can (m): what imitates a way
 that passes at 10 mm touches, some of the time."""
 _THERE_RAD = 0.02
+_NOTHING: FloatArray = np.zeros(3)
 
 
 class Demonstrator(Expert):
@@ -94,12 +97,19 @@ class Demonstrator(Expert):
                 return ahead
         spec, goal = self._env.spec, self._goal_in(0.0)
         if isinstance(spec, PegSpec) and goal.standoff_m < 0.0:
-            return self._insertion.learnable_set_point(q, velocity, set_point, goal, spec.caught_mm)
+            return self._insertion.learnable_set_point(
+                q, velocity, set_point, goal, spec.caught_mm, gently=bool(self._unseen().any())
+            )
         return super()._next_set_point(q, velocity, set_point)
 
     def _goal_in(self, ahead_s: float) -> Goal:
         goal = super()._goal_in(ahead_s)
+        goal = dataclasses.replace(goal, target=goal.target - self._unseen())
         return goal if self._has_seen_closely else _raised(goal)
+
+    def _unseen(self) -> FloatArray:
+        """How far the goal is from where the pictures show it, (3,) m."""
+        return self._env.privileged().get(GOAL_UNSEEN, _NOTHING)
 
     def _next_look(self, q: FloatArray) -> FloatArray:
         """Where to look from next, (7,) rad: from where the arm has come, it has looked."""

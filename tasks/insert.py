@@ -7,9 +7,9 @@ collision, and is called an overload.
 
 In ``insert-feel`` the hole is not quite where the paint says. No picture shows that, so the last
 millimetre has to be felt: by the wrench at the flange, and by where the tip stops. **The expert of
-that variant knows the hole**, which no learner can see, and goes straight in. A policy that
-imitates it learns where holes are on average, which is not enough; it has to learn the search by
-itself.
+that variant knows the hole**, which no learner can see, and goes straight in. The demonstrator does
+what a learner can do with what it sees: it presses gently where the paint says. A policy that
+imitates it has to learn the search by itself.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.errors import OptionError
-from hvs_suite.tasks.shared.family import Family, Progress, register
+from hvs_suite.tasks.shared.family import GOAL_UNSEEN, Family, Progress, register
 from hvs_suite.tasks.shared.goal import (
     HEIGHT,
     LATERAL,
@@ -72,7 +72,7 @@ class InsertSpec(PegSpec):
 
     family: ClassVar[str] = "insert"
     headline: ClassVar[tuple[str, ...]] = (DEPTH, PEAK_FORCE)
-    further_privileged: ClassVar[Mapping[str, tuple[str, ...]]] = {"hole_offset": ("x", "y")}
+    further_privileged: ClassVar[Mapping[str, tuple[str, ...]]] = {GOAL_UNSEEN: ("x", "y", "z")}
     plays_on: ClassVar[bool] = False
 
     goal_depth_m: float = 0.013
@@ -181,8 +181,8 @@ class Insert(Family[InsertSpec, InsertScenario]):
         "insert-feel": (
             "The hole is displaced from its paint by half a millimetre a direction, which no "
             "picture shows. A policy has to find it by the wrench and by where the tip stops, "
-            "gently and in time. The demonstrations do not show how, because the expert knows "
-            "the hole."
+            "gently and in time. The demonstrations do not show how: they press where the paint "
+            "says."
         ),
     }
     certificate_passes: ClassVar[int] = 4
@@ -264,8 +264,8 @@ class Insert(Family[InsertSpec, InsertScenario]):
         return {WRENCH: self._peg.wrench(physics)}
 
     def privileged(self) -> dict[str, FloatArray]:
-        """How far the hole is off its paint (m)."""
-        return {"hole_offset": self.scenario.hole_offset.copy()}
+        """How far the hole is off its paint, (3,) m, base frame."""
+        return {GOAL_UNSEEN: np.append(self.scenario.hole_offset, 0.0)}
 
     @classmethod
     def certify(cls, env: "Environment", scenarios: Iterable[int]) -> list["Check"]:

@@ -51,7 +51,7 @@ def fit_prior(
         columns: ``privileged.goal_position`` and ``privileged.goal_normal`` (n, 3),
             ``observation.state`` (n, 14), ``privileged.target_<camera>`` (n, 4) of each camera of
             the views, ``episode_index`` (n,), and those of
-            `hvs_suite.policies.belief.recorded.FURTHER_KEYS` that there are.
+            `hvs_suite.policies.training.dataset.FURTHER_KEYS` that there are.
         views: Camera name to its pose at each frame, nominal.
         period_s: Control period (s).
 

@@ -16,15 +16,13 @@ from hvs_suite.policies.training.dataset import (
     EPISODE,
     GOAL_NORMAL,
     GOAL_POSITION,
+    GOAL_UNSEEN,
     GOAL_VELOCITY,
     JOINT_OFFSET,
     TARGET_PREFIX,
 )
 
 Column = npt.NDArray[np.generic]
-
-FURTHER_KEYS = (GOAL_VELOCITY, JOINT_OFFSET)
-"""Columns that only some tasks have: elsewhere goals stand still, and encoders are right."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -118,16 +116,20 @@ def shown_goals(
     With zero errors of the encoders, the flange is elsewhere than the measured joints say, and all
     that the eye in the hand sees is off with it. The arm is sent in the same wrong angles. So what
     a policy can see, and where it has to go, is the goal as it lies by the true flange, put by the
-    flange that the encoders show: with T the pose of the flange, T(shown) T(true)^-1 goal.
+    flange that the encoders show: with T the pose of the flange, T(shown) T(true)^-1 goal. Where
+    no picture shows how far the goal is off, it is where the pictures show it.
 
     Args:
-        columns: State, goal and normal, (n, ...) each, and ``privileged.joint_offset`` (n, 7) rad,
-            measured less true angles, if there is any.
+        columns: State, goal and normal, (n, ...) each; if there are any,
+            ``privileged.joint_offset`` (n, 7) rad, measured less true angles, and
+            ``privileged.goal_unseen`` (n, 3) m.
 
     Returns:
         Goals (n, 3) m and unit normals (n, 3).
     """
     goal, normal = (np.asarray(columns[key], np.float64) for key in (GOAL_POSITION, GOAL_NORMAL))
+    if GOAL_UNSEEN in columns:
+        goal = goal - np.asarray(columns[GOAL_UNSEEN], np.float64)
     if JOINT_OFFSET not in columns:
         return goal, normal
     q = np.asarray(columns[STATE], np.float64)[:, :N_JOINTS]

@@ -15,12 +15,13 @@ from hvs_suite.policies.belief.eye import SIGHTING_SIZE
 from hvs_suite.policies.belief.lessons import Window, eye_lesson, window_lesson
 from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
 from hvs_suite.policies.belief.prior import take_prior
-from hvs_suite.policies.belief.recorded import FURTHER_KEYS, Recorded, recorded, recorded_keys
+from hvs_suite.policies.belief.recorded import Recorded, recorded, recorded_keys
 from hvs_suite.policies.belief.settings import as_numbers
 from hvs_suite.policies.hvs.configuration_hvs import HvsConfig
 from hvs_suite.policies.trained_for import trained_for
 from hvs_suite.policies.training.checkpoint import write_checkpoint
 from hvs_suite.policies.training.dataset import (
+    FURTHER_KEYS,
     Manifest,
     read_columns,
     read_manifest,

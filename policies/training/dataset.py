@@ -30,6 +30,10 @@ GOAL_POSITION = "privileged.goal_position"
 GOAL_NORMAL = "privileged.goal_normal"
 GOAL_VELOCITY = "privileged.goal_velocity"
 JOINT_OFFSET = "privileged.joint_offset"
+GOAL_UNSEEN = "privileged.goal_unseen"
+FURTHER_KEYS = (GOAL_VELOCITY, JOINT_OFFSET, GOAL_UNSEEN)
+"""Columns that only some tasks have: elsewhere goals stand still, encoders are right, and goals are
+where the pictures show them."""
 TARGET_PREFIX = "privileged.target_"
 
 Column = npt.NDArray[Any]
@@ -73,7 +77,7 @@ class Manifest:
     def trained_keys(self) -> list[str]:
         """The features that training reads: all observations, actions, targets, goal."""
         wanted = {STATE, ACTION, ACTION_EXECUTED, GOAL_POSITION, GOAL_NORMAL}
-        wanted |= {GOAL_VELOCITY, JOINT_OFFSET}
+        wanted |= {*FURTHER_KEYS}
         wanted |= {TARGET_PREFIX + name for name in self.cameras}
         wanted |= {IMAGES + name for name in self.cameras}
         wanted |= {
@@ -134,6 +138,12 @@ def read_manifest(root: Path) -> Manifest:
         wanted = dataset_features(find(origin.task).with_options(origin.options))
     except (UnknownTaskError, OptionError) as error:
         raise DatasetError(f"{root}: hvs.json: {error}") from error
+    # Trained without them, a policy would learn what nobody can see.
+    if missing := [key for key in FURTHER_KEYS if key in wanted and key not in manifest.features]:
+        raise DatasetError(
+            f"{root} lacks {missing[0]}, which {origin.task} has: an earlier hvs_suite "
+            "recorded it; record it again"
+        )
     for key in manifest.trained_keys:
         found = list(manifest.features[key]["shape"])
         # Pictures may be smaller than the task's; their size is checked in the files.

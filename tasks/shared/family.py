@@ -39,6 +39,7 @@ FloatArray = npt.NDArray[np.float64]
 
 ENTRY_POINTS = "hvs_suite.families"
 PLUGINS = "HVS_PLUGINS"
+GOAL_UNSEEN = "goal_unseen"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -193,7 +194,11 @@ class Family[S: Spec, C: Scenario](abc.ABC):
         return self.goal().target[None, :2]
 
     def privileged(self) -> dict[str, FloatArray]:
-        """Further values that only training and the expert may see, by name."""
+        """Further values that only training and the expert may see, by name.
+
+        Under `GOAL_UNSEEN`, how far the goal is from where the pictures show it, (3,) m, base
+        frame: demonstrations go where it is shown.
+        """
         return {}
 
     @classmethod

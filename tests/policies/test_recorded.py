@@ -6,7 +6,12 @@ import hvs_suite
 from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.datasets.features import STATE, observed_part
 from hvs_suite.policies.belief.recorded import shown_goals
-from hvs_suite.policies.training.dataset import GOAL_NORMAL, GOAL_POSITION, JOINT_OFFSET
+from hvs_suite.policies.training.dataset import (
+    GOAL_NORMAL,
+    GOAL_POSITION,
+    GOAL_UNSEEN,
+    JOINT_OFFSET,
+)
 
 
 def test_without_errors_of_the_encoders_goals_are_where_they_are() -> None:
@@ -17,6 +22,16 @@ def test_without_errors_of_the_encoders_goals_are_where_they_are() -> None:
     position, normal = shown_goals(columns)
     np.testing.assert_array_equal(position, columns[GOAL_POSITION])
     np.testing.assert_array_equal(normal, columns[GOAL_NORMAL])
+
+
+def test_a_hole_that_is_not_where_its_paint_is_counts_as_where_the_paint_is() -> None:
+    env = hvs_suite.load("insert-feel", split="dev")
+    frame = observed_part(env.spec, env.reset(scenario=0).observation, env)
+    columns = {key: frame[key][None] for key in (GOAL_POSITION, GOAL_NORMAL, GOAL_UNSEEN)}
+    [position], _ = shown_goals(columns)
+    painted = env.task.family.keypoints()["target"].position
+    np.testing.assert_allclose(position[:2], painted[:2], atol=1e-6)
+    assert np.abs(frame[GOAL_POSITION][:2] - painted[:2]).max() > 1e-4
 
 
 def test_an_arm_that_is_at_its_goal_is_there_by_its_encoders_too() -> None:

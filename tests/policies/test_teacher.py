@@ -109,6 +109,15 @@ def test_options_that_make_no_sense_are_refused(tmp_path, options, message):
         pretrain(SAMPLE, tmp_path / "out", steps=1, **{**SMALL, **options})
 
 
+def test_a_dataset_without_what_nobody_can_see_is_refused(tmp_path):
+    columns = miniature.scene(8, side=112)
+    miniature.write_dataset(
+        tmp_path / "data", columns, miniature.episodes(8), options={"joint_offset_deg": 0.05}
+    )
+    with pytest.raises(DatasetError, match=r"lacks privileged\.joint_offset"):
+        pretrain(tmp_path / "data", tmp_path / "out", steps=1, **SMALL)
+
+
 def test_a_dataset_that_does_not_say_what_is_true_is_refused(tmp_path):
     columns = miniature.scene(8, side=112)
     del columns["privileged.goal_normal"]
