@@ -1,12 +1,14 @@
 """Writes a LeRobot policy so that an earlier one stays intact until it is replaced."""
 
 import json
+import shutil
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 from hvs_suite.errors import OutputError, first_line
+from hvs_suite.files import replacing
 
 
 def write_checkpoint(
@@ -41,7 +43,9 @@ def write_checkpoint(
                 json.dumps(config, indent=2, sort_keys=True) + "\n"
             )
             for path in sorted(scratch.iterdir()):
-                path.replace(folder / path.name)
+                # safetensors makes files that only their owner may read.
+                with replacing(folder / path.name) as temporary:
+                    shutil.copyfile(path, temporary)
     except (OSError, SafetensorError) as error:
         raise OutputError(f"cannot write {folder}: {first_line(error)}") from error
 

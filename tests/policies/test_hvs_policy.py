@@ -170,6 +170,13 @@ def test_weights_are_kept_in_half_precision(played, tmp_path):
         torch.testing.assert_close(mine, theirs, rtol=1e-3, atol=1e-7)
 
 
+def test_whoever_may_read_a_new_file_may_read_a_checkpoint(played, tmp_path):
+    _, _, folder = played
+    (tmp_path / "new").touch()
+    modes = {path.stat().st_mode for path in folder.iterdir() if path.is_file()}
+    assert modes == {(tmp_path / "new").stat().st_mode}
+
+
 def test_goal_and_wrench_are_named_in_the_configuration(played):
     spec, policy, _ = played
     named = [policy.config.goal_key, policy.config.wrench_key]
