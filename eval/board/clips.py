@@ -1,4 +1,4 @@
-"""A clip of a success and of a failure of each entry, drawn from its action log.
+"""A clip of a success and of a failure of each entry but ``random``'s, drawn from its action log.
 
 Clips are animated AVIF: a picture to the page, so it plays from a file, on a phone, inside the
 page, without a player (iOS does not play a video out of a ``data:`` address). Browsers have had it
@@ -23,6 +23,7 @@ import numpy as np
 from hvs_suite import files, reading, registry
 from hvs_suite.errors import OutputError, ResultError
 from hvs_suite.eval.board.submission import Submission
+from hvs_suite.eval.protocol import UNWATCHED
 from hvs_suite.eval.scoring import action_log, result_file, trial
 from hvs_suite.eval.scoring.result_file import EpisodeRow, Result
 from hvs_suite.rollout import Action, Observation
@@ -128,6 +129,7 @@ def clips(
     orders = [
         _Order(entry, kind, row, _path(folder, entry, kind, row))
         for entry in submissions
+        if entry.result.summary.policy != UNWATCHED
         for kind, row in choose(entry.result)
     ]
     missing = [order for order in orders if not order.path.exists()]

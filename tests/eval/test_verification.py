@@ -232,7 +232,7 @@ def test_only_a_handful_of_outcomes_is_left_to_rounding(
 # --- what the log does not hold -------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module", params=["expert", "random"])
+@pytest.fixture(scope="module", params=["expert", "zero"])
 def partly_logged(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four scenarios, the actions of the last two of which are not kept."""
     path = tmp_path_factory.mktemp("partly") / "result.json"
