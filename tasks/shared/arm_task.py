@@ -30,7 +30,7 @@ from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared import actions, appearance, observations, rewards
 from hvs_suite.tasks.shared.family import Family, Progress
 from hvs_suite.tasks.shared.goal import LATERAL, POSITION, TILT, Goal, Keypoint, Tip, goal_errors
-from hvs_suite.tasks.shared.scenario import Scenario, ScenarioSource
+from hvs_suite.tasks.shared.scenario import Scenario, ScenarioSource, StepStream
 from hvs_suite.tasks.shared.spec import CAMERA_NAMES, Spec
 from hvs_suite.tasks.shared.strewn import Strewn
 
@@ -95,6 +95,7 @@ class ArmTask(composer.Task):
         family.build(self._cell)
         self._strewn = Strewn(self._cell, spec) if spec.n_strewn else None
         self.source = ScenarioSource(spec, family.named, split, family.draw)
+        self._action_noise = StepStream(self.source, "noise-action")
         self.time_limit_steps = spec.time_limit_steps
         self.camera_side = max(spec.eih_resolution, spec.eth_resolution)
         self.multisampling = spec.multisampling
@@ -222,6 +223,10 @@ class ArmTask(composer.Task):
             action, spec.action_mode, clip=self.environment.clip_actions
         )
         self._n_clipped += clipped
+        if spec.action_noise > 0:
+            random = self._action_noise.at(self.scenario.index, self.environment.control_steps)
+            values = values + spec.action_noise * random.normal(size=values.shape)
+            values = np.clip(values, -1.0, 1.0)
         self._commanded = actions.set_point(
             values, spec.action_mode, self._commanded, spec.control_period_s
         )

@@ -135,6 +135,10 @@ class Disturbances:
         image_noise: Standard deviation of pixel noise (grey levels of 255).
         image_blur_px: Standard deviation of the Gaussian that pictures are blurred with (px).
         joint_offset_deg: Standard deviation of the encoder zero error (deg), cut at 2 sigma.
+        action_noise: Standard deviation of the noise on each number of an action, whose full scale
+            is 1: a fraction of the joint's range, of 0.1 rad, of the joint's speed, or of 0.5 m/s
+            and 1.5 rad/s, by the action mode. Each control step of a scene has noise of its own,
+            and what is commanded stays in [-1, 1].
         depth_noise_px: Standard deviation of the disparities behind depth pictures (px of a sensor
             640 px wide), which then have steps and holes as well; 0 for true depth.
         n_strewn: Things that lie around and are not the target: discs of other colours, red squares
@@ -158,6 +162,7 @@ class Disturbances:
     image_noise: float = scene(0.0)
     image_blur_px: float = 0.0
     joint_offset_deg: float = scene(0.0)
+    action_noise: float = 0.0
     depth_noise_px: float = 0.0
     n_strewn: int = scene(0)
     unannounced: bool = False
@@ -262,6 +267,7 @@ class Spec(Timing, Cameras, Disturbances):
             "image_noise",
             "image_blur_px",
             "joint_offset_deg",
+            "action_noise",
             "depth_noise_px",
             "n_strewn",
         )
@@ -430,6 +436,7 @@ class Spec(Timing, Cameras, Disturbances):
             "image noise": self.image_noise > 0,
             "blur": self.image_blur_px > 0,
             "joint offsets": self.joint_offset_deg > 0,
+            "action noise": self.action_noise > 0,
             "latency": self.latency_steps > 0,
             "depth noise": self.depth_noise_px > 0,
         }
