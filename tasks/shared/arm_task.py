@@ -29,7 +29,16 @@ from hvs_suite.cell.robot import (
 from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared import actions, appearance, observations, rewards
 from hvs_suite.tasks.shared.family import Family, Progress
-from hvs_suite.tasks.shared.goal import LATERAL, POSITION, TILT, Goal, Keypoint, Tip, goal_errors
+from hvs_suite.tasks.shared.goal import (
+    HEIGHT,
+    LATERAL,
+    POSITION,
+    TILT,
+    Goal,
+    Keypoint,
+    Tip,
+    goal_errors,
+)
 from hvs_suite.tasks.shared.scenario import Scenario, ScenarioSource, StepStream
 from hvs_suite.tasks.shared.spec import CAMERA_NAMES, Spec
 from hvs_suite.tasks.shared.strewn import Strewn
@@ -110,7 +119,7 @@ class ArmTask(composer.Task):
         self._observables = observations.make_observables(self)
         self._bounded = tuple(m for m in spec.metrics if m.over == "step" and m.bound is not None)
         self.slack = {}
-        self._is_shaped = bool({"position", "rotation", "exponential"} & set(spec.rewards))
+        self._is_shaped = bool(rewards.OF_ERRORS & set(spec.rewards))
         self._scenario: Scenario | None = None
         self._goal_configurations: FloatArray | None = None
         self._errors: dict[str, float] = {}
@@ -296,10 +305,11 @@ class ArmTask(composer.Task):
 
     def _step_outcome(self, physics: mjcf.Physics) -> rewards.StepOutcome:
         """What the rewards of the control step depend on; costly parts only where asked for."""
-        distance_m = tilt_deg = joint_distance = None
+        distance_m = lateral_m = height_m = tilt_deg = joint_distance = None
         if self._is_shaped:
             errors = goal_errors(self.tip(physics), self.goal())
             distance_m, tilt_deg = errors[POSITION] / 1000.0, errors[TILT]
+            lateral_m, height_m = errors[LATERAL] / 1000.0, abs(errors[HEIGHT]) / 1000.0
         if self._goal_configurations is not None:
             joint_distance = rewards.joint_distance(
                 self.joint_positions(physics), self._goal_configurations
@@ -309,6 +319,8 @@ class ArmTask(composer.Task):
             collision=self._collision,
             truncated=self._truncated,
             distance_m=distance_m,
+            lateral_m=lateral_m,
+            height_m=height_m,
             tilt_deg=tilt_deg,
             joint_distance=joint_distance,
         )

@@ -27,7 +27,15 @@ if TYPE_CHECKING:
 Start = Literal["zero", "random", "fixed", "near_goal", "mixed"] | tuple[float, ...]
 ActionMode = Literal["joint_position", "joint_delta", "joint_velocity", "flange_twist"]
 RewardTerm = Literal[
-    "goal", "collision", "time", "position", "rotation", "joint_space", "exponential"
+    "goal",
+    "collision",
+    "time",
+    "position",
+    "lateral",
+    "height",
+    "rotation",
+    "joint_space",
+    "exponential",
 ]
 
 PRESETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
