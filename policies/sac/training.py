@@ -35,7 +35,7 @@ from hvs_suite.tasks.shared.spec import (
 )
 
 PACKAGES = ("hvs-suite", "mujoco", "numpy", "stable-baselines3", "torch")
-INPUTS = PRESETS["vision"]
+INPUTS = (*PRESETS["vision"], "joint_torques")
 
 
 def train_sac(

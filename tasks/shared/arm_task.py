@@ -484,6 +484,20 @@ class ArmTask(composer.Task):
         """True joint speeds, (7,) rad/s."""
         return np.asarray(physics.data.ptr.qvel[self._qvel])
 
+    def joint_torques(self, physics: mjcf.Physics) -> FloatArray:
+        """Torques of the drives about the joints' axes, (7,) N m: they carry and move the arm.
+
+        What the torque sensors of an iiwa show, which sit between gear and link: the weight, the
+        motion and what the arm presses against, all together, within the published 176, 176, 110,
+        110, 110, 40 and 40 N m. They are not the *external* torques that KUKA's controller derives
+        from them by a model of the arm. Real sensors do not show what speeds the rotors up, which
+        is in ours (0.1 kg m^2 times the acceleration: at most 1.4 N m at the published ones), and
+        have noise, which ours have not.
+        """
+        # MuJoCo has them of before the last substep; the next substep computes them anew.
+        mujoco.mj_fwdActuation(physics.model.ptr, physics.data.ptr)
+        return np.asarray(physics.data.ptr.qfrc_actuator[self._qvel])
+
     def flange_position(self, physics: mjcf.Physics) -> FloatArray:
         """True position of the flange face's centre, (3,) m, base frame."""
         return physics.data.ptr.site_xpos[self._flange].copy()

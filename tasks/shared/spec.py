@@ -51,7 +51,7 @@ PRESETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )
 """Observations by preset; ``state`` is privileged and never mixes with pictures."""
-VISION_OBSERVATIONS = (*PRESETS["vision"], "eih_depth", "eth_depth")
+VISION_OBSERVATIONS = (*PRESETS["vision"], "joint_torques", "eih_depth", "eth_depth")
 JOINTS = 7
 JOINT_LIMITS_DEG = (170, 120, 170, 120, 170, 120, 175)
 MAX_RESOLUTION = 2048
@@ -226,8 +226,8 @@ class Spec(Timing, Cameras, Disturbances):
             a few centimetres and degrees from the goal pose; ``mixed``, half the task's ``zero``
             or ``random`` start, half ``near_goal``; or seven angles (rad).
         observations: Preset, or names joined by ``+``: ``eih``, ``eth``, ``eih_depth``,
-            ``eth_depth``, ``joint_positions``, ``joint_velocities``, and what the family adds
-            (``further_observations``), which presets show as well.
+            ``eth_depth``, ``joint_positions``, ``joint_velocities``, ``joint_torques``, and what
+            the family adds (``further_observations``), which presets show as well.
         normalise_observation: Images to [0, 1] and joints to [-1, 1], as in the thesis.
         action_mode: Meaning of the seven (``flange_twist``: six) action numbers.
         rewards: Reward terms that are switched on; never changes success or termination.
