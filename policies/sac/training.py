@@ -9,14 +9,19 @@ import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from gymnasium import spaces
 from stable_baselines3 import SAC
 
-from hvs_suite.errors import OptionError
+from hvs_suite.errors import OptionError, PolicyError
+from hvs_suite.policies.belief.eye import Eye
+from hvs_suite.policies.catalogue import checkpoint_folder
+from hvs_suite.policies.checkpoints.loading import load_network
 from hvs_suite.policies.rl.evaluation import Evaluator
+from hvs_suite.policies.rl.guide import SHARE as GUIDE_SHARE
+from hvs_suite.policies.rl.guide import Guide, PlayedActions
 from hvs_suite.policies.rl.journal import Journal, make_journal
 from hvs_suite.policies.rl.outcome import Outcome, Progress, check_run
 from hvs_suite.policies.rl.run import Run
@@ -46,6 +51,8 @@ def train_sac(
     steps: int | None = None,
     seed: int = 0,
     settings: Settings | None = None,
+    guide: str | None = None,
+    guide_share: float = GUIDE_SHARE,
     rewards: Sequence[str] = THESIS_REWARDS,
     options: Mapping[str, Any] | None = None,
     split: str = "train",
@@ -66,6 +73,10 @@ def train_sac(
             or both for the first reached.
         seed: Of weights, scenes, exploration and batches; below 2^32.
         settings: Of SAC; the thesis's by default.
+        guide: Policy that plays some of the episodes, for the replay memory to hold what
+            exploration would not find: ``expert``, or any other that `demonstrator_factory` knows;
+            None for exploration alone.
+        guide_share: Probability that an episode is the guide's, above 0 and at most 1.
         rewards: Reward terms to learn from, as the task's option of that name.
         options: Further task options, for studies.
         split: Stream of scenes to learn from; anything but ``test``.
@@ -81,6 +92,7 @@ def train_sac(
     Raises:
         UnknownTaskError: There is no such task.
         OptionError: No budget, or a value that makes no sense.
+        PolicyError: There is no such guide, or no pretrained eyes for the task.
         OutputError: ``out`` cannot be written, or holds something else than this run.
     """
     settings = settings or Settings()
@@ -88,7 +100,9 @@ def train_sac(
     options = options_of(spec)
     limit = Budget(steps, minutes)
     check_run(seed, split, eval_every, eval_episodes)
-    _check(spec, device)
+    _check(spec, settings, device)
+    trained = pretrained_eyes(spec) if settings.eyes == "pretrained" else {}
+    guiding = None if guide is None else Guide(guide, guide_share)
     prepare_process()
     identity = {
         "task": task,
@@ -96,6 +110,7 @@ def train_sac(
         "options": options,
         "split": split,
         "seed": seed,
+        "guide": None if guiding is None else dataclasses.asdict(guiding),
         **json.loads(json.dumps(dataclasses.asdict(settings))),
     }
     with contextlib.ExitStack() as stack:
@@ -104,10 +119,13 @@ def train_sac(
         write_train_config(out, identity, budget, PACKAGES, device=device)
         # SB3 draws from the global generators of NumPy and torch.
         stack.enter_context(library_seeds(seed))
-        journal = stack.enter_context(contextlib.closing(make_journal(spec, options, split, seed)))
-        model = _make_model(journal, settings, seed, device)
+        journal = stack.enter_context(
+            contextlib.closing(make_journal(spec, options, split, seed, guiding))
+        )
+        model = _make_model(journal, settings, trained, seed, device)
         assert isinstance(model.observation_space, spaces.Dict)
-        write_config(out, spec, model.observation_space, settings.hidden)
+        channels = next((eye.channels for eye in trained.values()), None)
+        write_config(out, spec, model.observation_space, settings, channels)
         evaluator = stack.enter_context(contextlib.closing(Evaluator(spec, options, eval_episodes)))
         run = Run(out, _Sac(out, model), evaluator, on_progress)
         stack.callback(run.close)
@@ -131,10 +149,41 @@ class _Sac:
         save_actor(self._out, self.model.actor)
 
 
-def _make_model(journal: Journal, settings: Settings, seed: int, device: str) -> SAC:
+def pretrained_eyes(spec: Spec) -> dict[str, Eye]:
+    """The eyes of the weights shipped for a task.
+
+    Args:
+        spec: The task, its options included.
+
+    Returns:
+        The eye of each picture that the task shows, by name.
+
+    Raises:
+        PolicyError: None are shipped, or they are for pictures of another size.
+    """
+    folder = checkpoint_folder("pretrained", spec.name)
+    network = load_network(folder)
+    if network.shape.n_goals:
+        raise PolicyError(f"the eyes of {folder.name} look for the target that they are told of")
+    found: dict[str, Eye] = {}
+    for name in (name for name in spec.observed if name in ("eih", "eth")):
+        shown = getattr(spec, f"{name}_channels"), getattr(spec, f"{name}_resolution")
+        if network.shape.cameras.get(name) != shown:
+            raise PolicyError(
+                f"the pretrained eyes for {spec.name} do not take {name} with {shown[0]} channels "
+                f"and {shown[1]} px; leave its size as it is"
+            )
+        found[name] = cast(Eye, network.eyes[name])
+    return found
+
+
+def _make_model(
+    journal: Journal, settings: Settings, trained: Mapping[str, Eye], seed: int, device: str
+) -> SAC:
     return SAC(
         "MultiInputPolicy",
         journal,
+        replay_buffer_class=PlayedActions,
         learning_rate=settings.learning_rate,
         buffer_size=settings.replay_size,
         learning_starts=settings.random_steps,
@@ -144,13 +193,17 @@ def _make_model(journal: Journal, settings: Settings, seed: int, device: str) ->
         train_freq=(settings.collect_steps, "step"),
         gradient_steps=settings.updates,
         target_update_interval=1,
-        policy_kwargs=policy_kwargs(list(settings.hidden)),
+        policy_kwargs=policy_kwargs(settings, trained),
         seed=seed,
         device=device,
     )
 
 
-def _check(spec: Spec, device: str) -> None:
+def _check(spec: Spec, settings: Settings, device: str) -> None:
+    if settings.eyes == "shared" and (
+        not {"eih", "eth"} <= set(spec.observed) or spec.eih_channels != spec.eth_channels
+    ):
+        raise OptionError("shared eyes need both pictures, with the same number of channels")
     others = [name for name in spec.observed if name not in INPUTS]
     if others or spec.normalise_observation:
         raise OptionError(
