@@ -1,4 +1,4 @@
-"""PPO, and SAC with and without hindsight, on what is true instead of pictures: see from-state.md.
+"""PPO, and SAC by itself, with hindsight or with a guide, from the true state: see from-state.md.
 
     python docs/experiments/from_state.py her --action-mode joint_velocity --steps 100000 \
         --out runs/her.json
@@ -20,10 +20,12 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 import hvs_suite
+from hvs_suite.datasets.expert import make_expert
 from hvs_suite.files import replacing
+from hvs_suite.policies.rl.guide import SHARE, Guided, PlayedActions
 from hvs_suite.tasks.shared.spec import THESIS_REWARDS
 
-METHODS = ("ppo", "sac", "her")
+METHODS = ("ppo", "sac", "her", "guided")
 EVALUATIONS = 10
 """On the way; one more comes at the end."""
 
@@ -51,21 +53,24 @@ def make_env(task: str, method: str, split: str, action_mode: str) -> gymnasium.
 
 
 def make_model(env: gymnasium.Env[Any, Any], method: str, seed: int) -> BaseAlgorithm:
-    """The learner: hindsight goals are four of five, from later in the same episode.
+    """The learner: four of five goals are from later in the same episode, in hindsight.
 
     Args:
-        env: As `make_env` makes it.
+        env: As `make_env` makes it; the expert plays a fifth of its episodes if it is to guide.
         method: One of `METHODS`.
         seed: Of weights, exploration and batches.
     """
     if method == "ppo":
         return PPO("MultiInputPolicy", env, seed=seed, device="cpu")
-    hindsight: dict[str, Any] = {}
+    memory: dict[str, Any] = {}
     if method == "her":
-        hindsight = {
+        memory = {
             "replay_buffer_class": HerReplayBuffer,
             "replay_buffer_kwargs": {"n_sampled_goal": 4, "goal_selection_strategy": "future"},
         }
+    if method == "guided":
+        env = Guided(env, make_expert, SHARE, seed)
+        memory = {"replay_buffer_class": PlayedActions}
     return SAC(
         "MultiInputPolicy",
         env,
@@ -73,7 +78,7 @@ def make_model(env: gymnasium.Env[Any, Any], method: str, seed: int) -> BaseAlgo
         learning_starts=1000,
         seed=seed,
         device="cpu",
-        **hindsight,
+        **memory,
     )
 
 

@@ -49,3 +49,10 @@ def test_without_hindsight_the_same_learner_has_the_goals_of_the_scenes_alone(sc
     model.learn(30)
     assert float(model.replay_buffer.sample(256).rewards.sum()) == 0.0
     assert script.evaluate(model, env, 1)["success"] == 0.0
+
+
+def test_a_guide_finds_the_goals_of_the_scenes(script):
+    env = script.make_env("align-easy", "guided", "train", "joint_position")
+    model = script.make_model(env, "guided", seed=1)
+    model.learn(500)
+    assert model.replay_buffer.rewards[:500].sum() >= 1.0
