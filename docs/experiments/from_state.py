@@ -22,7 +22,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 import hvs_suite
 from hvs_suite.datasets.expert import make_expert
 from hvs_suite.files import replacing
-from hvs_suite.policies.rl.guide import SHARE, Guided, PlayedActions
+from hvs_suite.policies.rl.guide import Guide, Guided, PlayedActions
 from hvs_suite.tasks.shared.spec import THESIS_REWARDS
 
 METHODS = ("ppo", "sac", "her", "guided")
@@ -69,7 +69,7 @@ def make_model(env: gymnasium.Env[Any, Any], method: str, seed: int) -> BaseAlgo
             "replay_buffer_kwargs": {"n_sampled_goal": 4, "goal_selection_strategy": "future"},
         }
     if method == "guided":
-        env = Guided(env, make_expert, SHARE, seed)
+        env = Guided(env, Guide("expert", make_expert), seed)
         memory = {"replay_buffer_class": PlayedActions}
     return SAC(
         "MultiInputPolicy",

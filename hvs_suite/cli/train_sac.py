@@ -85,9 +85,15 @@ class TrainSac:
         options = registry.find(self.task).options_from_text(self.option)
         if "rewards" in options:
             raise OptionError("name the terms to learn from with --reward, not as an option")
+        from hvs_suite.policies.catalogue import checkpoint_folder, demonstrator_factory
+        from hvs_suite.policies.rl.guide import Guide
         from hvs_suite.policies.sac.training import train_sac
         from hvs_suite.tasks.shared.spec import THESIS_REWARDS
 
+        guide = None
+        if self.guide is not None:
+            make = demonstrator_factory(self.guide, self.task, options)
+            guide = Guide(self.guide, make, self.guide_share)
         show_run(
             functools.partial(train_sac, self.task, self.out),
             self.out,
@@ -95,8 +101,10 @@ class TrainSac:
             steps=self.steps,
             seed=self.seed,
             settings=settings,
-            guide=self.guide,
-            guide_share=self.guide_share,
+            eyes_of=checkpoint_folder("pretrained", self.task)
+            if self.eyes == "pretrained"
+            else None,
+            guide=guide,
             options=options,
             rewards=self.reward or THESIS_REWARDS,
             eval_every=self.eval_every,

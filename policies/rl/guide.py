@@ -6,7 +6,6 @@ that it takes to play an episode again are the scene and the actions that the le
 """
 
 import dataclasses
-from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
@@ -15,9 +14,7 @@ import numpy.typing as npt
 from stable_baselines3.common.buffers import DictReplayBuffer
 
 from hvs_suite.errors import OptionError
-from hvs_suite.policies.catalogue import demonstrator_factory
 from hvs_suite.rollout import Policy, PolicyFactory
-from hvs_suite.tasks.shared.spec import Spec
 
 SHARE = 0.2
 """Probability that an episode is the guide's, by default."""
@@ -32,7 +29,8 @@ class Guide:
     """Who guides, and how often.
 
     Attributes:
-        name: A policy, as `demonstrator_factory` takes it.
+        name: What the run is noted with.
+        make: Builds the policy for an environment; it may know what is true.
         share: Probability that an episode is the guide's.
 
     Raises:
@@ -40,24 +38,13 @@ class Guide:
     """
 
     name: str
+    make: PolicyFactory
     share: float = SHARE
 
     def __post_init__(self) -> None:
         """Check the share."""
         if not 0.0 < self.share <= 1.0:
             raise OptionError(f"guide_share must be above 0 and at most 1, not {self.share}")
-
-    def policy(self, spec: Spec, options: Mapping[str, Any]) -> PolicyFactory:
-        """Find the policy for a task.
-
-        Args:
-            spec: The named task.
-            options: Task options that differ from it.
-
-        Raises:
-            PolicyError: There is no such policy, or it does not fit the task.
-        """
-        return demonstrator_factory(self.name, spec.name, options)
 
 
 class Guided(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -67,20 +54,17 @@ class Guided(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     Args:
         env: A task of the suite; takes ``options={"scenario": i}`` in ``reset``.
-        guide: Builds the guide for the task's environment.
-        share: Probability that an episode is the guide's.
+        guide: Who guides, and how often.
         seed: Of the run.
 
     Raises:
         HvsError: The guide cannot play the task.
     """
 
-    def __init__(
-        self, env: gymnasium.Env[Any, Any], guide: PolicyFactory, share: float, seed: int
-    ) -> None:
+    def __init__(self, env: gymnasium.Env[Any, Any], guide: Guide, seed: int) -> None:
         super().__init__(env)
-        self._guide: Policy = guide(env.unwrapped.environment)  # type: ignore[attr-defined]
-        self._share = share
+        self._guide: Policy = guide.make(env.unwrapped.environment)  # type: ignore[attr-defined]
+        self._share = guide.share
         self._seed = seed
         self._guided = False
         self._seen: Any = None

@@ -92,7 +92,7 @@ def make_journal(
     )
     outcomes: tuple[str, ...] = OUTCOMES
     if guide is not None:
-        env = Guided(env, guide.policy(spec, options), guide.share, seed)
+        env = Guided(env, guide, seed)
         outcomes = (*OUTCOMES, GUIDED)
     # The monitor inside: it sees the steps that a restored journal plays again.
     return Journal(Monitor(env, info_keywords=outcomes), seed)

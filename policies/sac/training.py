@@ -17,10 +17,8 @@ from stable_baselines3 import SAC
 
 from hvs_suite.errors import OptionError, PolicyError
 from hvs_suite.policies.belief.eye import Eye
-from hvs_suite.policies.catalogue import checkpoint_folder
-from hvs_suite.policies.checkpoints.loading import load_network
+from hvs_suite.policies.checkpoints.loading import load_network, weights_digest
 from hvs_suite.policies.rl.evaluation import Evaluator
-from hvs_suite.policies.rl.guide import SHARE as GUIDE_SHARE
 from hvs_suite.policies.rl.guide import Guide, PlayedActions
 from hvs_suite.policies.rl.journal import Journal, make_journal
 from hvs_suite.policies.rl.outcome import Outcome, Progress, check_run
@@ -51,8 +49,8 @@ def train_sac(
     steps: int | None = None,
     seed: int = 0,
     settings: Settings | None = None,
-    guide: str | None = None,
-    guide_share: float = GUIDE_SHARE,
+    eyes_of: Path | None = None,
+    guide: Guide | None = None,
     rewards: Sequence[str] = THESIS_REWARDS,
     options: Mapping[str, Any] | None = None,
     split: str = "train",
@@ -73,10 +71,10 @@ def train_sac(
             or both for the first reached.
         seed: Of weights, scenes, exploration and batches; below 2^32.
         settings: Of SAC; the thesis's by default.
-        guide: Policy that plays some of the episodes, for the replay memory to hold what
-            exploration would not find: ``expert``, or any other that `demonstrator_factory` knows;
-            None for exploration alone.
-        guide_share: Probability that an episode is the guide's, above 0 and at most 1.
+        eyes_of: Checkpoint of an `hvs` policy whose eyes are to be used, where the settings have
+            them pretrained.
+        guide: Policy that plays some of the episodes, so that the replay memory holds what
+            exploration would not find; None for exploration alone.
         rewards: Reward terms to learn from, as the task's option of that name.
         options: Further task options, for studies.
         split: Stream of scenes to learn from; anything but ``test``.
@@ -92,7 +90,7 @@ def train_sac(
     Raises:
         UnknownTaskError: There is no such task.
         OptionError: No budget, or a value that makes no sense.
-        PolicyError: There is no such guide, or no pretrained eyes for the task.
+        PolicyError: The eyes are for other pictures, or the guide cannot play the task.
         OutputError: ``out`` cannot be written, or holds something else than this run.
     """
     settings = settings or Settings()
@@ -101,8 +99,11 @@ def train_sac(
     limit = Budget(steps, minutes)
     check_run(seed, split, eval_every, eval_episodes)
     _check(spec, settings, device)
-    trained = pretrained_eyes(spec) if settings.eyes == "pretrained" else {}
-    guiding = None if guide is None else Guide(guide, guide_share)
+    if (settings.eyes == "pretrained") != (eyes_of is not None):
+        raise OptionError(
+            "name the checkpoint whose eyes to use with pretrained eyes, and only then"
+        )
+    trained = {} if eyes_of is None else _trained_eyes(eyes_of, spec)
     prepare_process()
     identity = {
         "task": task,
@@ -110,7 +111,8 @@ def train_sac(
         "options": options,
         "split": split,
         "seed": seed,
-        "guide": None if guiding is None else dataclasses.asdict(guiding),
+        "eyes_of": None if eyes_of is None else weights_digest(eyes_of),
+        "guide": None if guide is None else [guide.name, guide.share],
         **json.loads(json.dumps(dataclasses.asdict(settings))),
     }
     with contextlib.ExitStack() as stack:
@@ -120,7 +122,7 @@ def train_sac(
         # SB3 draws from the global generators of NumPy and torch.
         stack.enter_context(library_seeds(seed))
         journal = stack.enter_context(
-            contextlib.closing(make_journal(spec, options, split, seed, guiding))
+            contextlib.closing(make_journal(spec, options, split, seed, guide))
         )
         model = _make_model(journal, settings, trained, seed, device)
         assert isinstance(model.observation_space, spaces.Dict)
@@ -149,29 +151,18 @@ class _Sac:
         save_actor(self._out, self.model.actor)
 
 
-def pretrained_eyes(spec: Spec) -> dict[str, Eye]:
-    """The eyes of the weights shipped for a task.
-
-    Args:
-        spec: The task, its options included.
-
-    Returns:
-        The eye of each picture that the task shows, by name.
-
-    Raises:
-        PolicyError: None are shipped, or they are for pictures of another size.
-    """
-    folder = checkpoint_folder("pretrained", spec.name)
+def _trained_eyes(folder: Path, spec: Spec) -> dict[str, Eye]:
+    """The eye of each picture that a task shows, by name, from an `hvs` checkpoint."""
     network = load_network(folder)
     if network.shape.n_goals:
-        raise PolicyError(f"the eyes of {folder.name} look for the target that they are told of")
+        raise PolicyError(f"the eyes of {folder} have to be told which target is meant")
     found: dict[str, Eye] = {}
     for name in (name for name in spec.observed if name in ("eih", "eth")):
         shown = getattr(spec, f"{name}_channels"), getattr(spec, f"{name}_resolution")
         if network.shape.cameras.get(name) != shown:
             raise PolicyError(
-                f"the pretrained eyes for {spec.name} do not take {name} with {shown[0]} channels "
-                f"and {shown[1]} px; leave its size as it is"
+                f"the eyes of {folder} do not take {name} with {shown[0]} channels and "
+                f"{shown[1]} px, as {spec.name} shows it"
             )
         found[name] = cast(Eye, network.eyes[name])
     return found
