@@ -226,8 +226,9 @@ class Spec(Timing, Cameras, Disturbances):
             a few centimetres and degrees from the goal pose; ``mixed``, half the task's ``zero``
             or ``random`` start, half ``near_goal``; or seven angles (rad).
         observations: Preset, or names joined by ``+``: ``eih``, ``eth``, ``eih_depth``,
-            ``eth_depth``, ``joint_positions``, ``joint_velocities``, ``joint_torques``, and what
-            the family adds (``further_observations``), which presets show as well.
+            ``eth_depth``, ``joint_positions``, ``joint_velocities``, ``joint_torques`` (what the
+            drives exert, N m, the arm's weight included), and what the family adds
+            (``further_observations``), which presets show as well.
         normalise_observation: Images to [0, 1] and joints to [-1, 1], as in the thesis.
         action_mode: Meaning of the seven (``flange_twist``: six) action numbers.
         rewards: Reward terms that are switched on; never changes success or termination.
