@@ -85,9 +85,12 @@ class Config(TrainedFor):
     eye_channels: Size | None = None
 
     @pydantic.model_validator(mode="after")
-    def _has_channels(self) -> "Config":
+    def _has_eyes(self) -> "Config":
         if (self.eyes == "pretrained") != (self.eye_channels is not None):
             raise ValueError("pretrained eyes have eye_channels, and others have none")
+        channels = {part.shape[0] for part in self.inputs.values() if part.shape is not None}
+        if self.eyes == "shared" and len(channels) > 1:
+            raise ValueError("shared eyes read images with the same number of channels")
         return self
 
 
