@@ -6,6 +6,7 @@ from pathlib import Path
 
 from hvs_suite.cli.rl_session import show_run
 from hvs_suite.errors import OptionError
+from hvs_suite.policies.sac.settings import EyeKind, Settings
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -32,6 +33,11 @@ class TrainSac:
         random_steps: Environment steps with random actions before learning starts.
         collect_steps: Environment steps an iteration.
         updates: Updates after each iteration.
+        eyes: Networks of the images: apart, one each; shared, one for both; or pretrained, the eyes
+            of the weights shipped for the task, which are not trained further.
+        shared_trunk: Let actor and critics share the sub-networks of the inputs.
+        guide: Policy that plays some of the episodes to learn from, such as expert.
+        guide_share: Probability that an episode is the guide's.
         hidden_units: Width of each of the two dense layers behind the sub-networks.
         device: Where the networks are: cpu or cuda.
         option: Parameter of the task to change for a study, such as target_diameter_m=0.03; give it
@@ -52,6 +58,10 @@ class TrainSac:
     random_steps: int = 10_000
     collect_steps: int = 20
     updates: int = 1
+    eyes: EyeKind = "apart"
+    shared_trunk: bool = False
+    guide: str | None = None
+    guide_share: float = 0.2
     hidden_units: int = 256
     device: str = "cpu"
     option: tuple[str, ...] = ()
@@ -59,7 +69,6 @@ class TrainSac:
     def run(self) -> None:
         """Train, showing how it goes, and say what came of it."""
         from hvs_suite import registry
-        from hvs_suite.policies.sac.settings import Settings
 
         settings = Settings(
             learning_rate=self.learning_rate,
@@ -69,14 +78,22 @@ class TrainSac:
             collect_steps=self.collect_steps,
             updates=self.updates,
             hidden=(self.hidden_units, self.hidden_units),
+            eyes=self.eyes,
+            shared_trunk=self.shared_trunk,
         )
         # Before SB3 is imported, which takes seconds.
         options = registry.find(self.task).options_from_text(self.option)
         if "rewards" in options:
             raise OptionError("name the terms to learn from with --reward, not as an option")
+        from hvs_suite.policies.catalogue import checkpoint_folder, demonstrator_factory
+        from hvs_suite.policies.rl.guide import Guide
         from hvs_suite.policies.sac.training import train_sac
         from hvs_suite.tasks.shared.spec import THESIS_REWARDS
 
+        guide = None
+        if self.guide is not None:
+            make = demonstrator_factory(self.guide, self.task, options)
+            guide = Guide(self.guide, make, self.guide_share)
         show_run(
             functools.partial(train_sac, self.task, self.out),
             self.out,
@@ -84,6 +101,10 @@ class TrainSac:
             steps=self.steps,
             seed=self.seed,
             settings=settings,
+            eyes_of=checkpoint_folder("pretrained", self.task)
+            if self.eyes == "pretrained"
+            else None,
+            guide=guide,
             options=options,
             rewards=self.reward or THESIS_REWARDS,
             eval_every=self.eval_every,

@@ -63,6 +63,7 @@ class Eye(nn.Module):
         n_goals: Length of the one-hot vector that says which target is meant; 0 for none.
 
     Attributes:
+        channels: Channels of the features.
         train_in_bfloat16: Train the convolutions in bfloat16, where the processor is faster at it.
             Evaluation is always in float32, and so is everything that measures.
     """
@@ -71,6 +72,7 @@ class Eye(nn.Module):
 
     def __init__(self, in_channels: int, side: int, channels: int, n_goals: int = 0) -> None:
         super().__init__()
+        self.channels = channels
         layers: list[nn.Module] = []
         width = in_channels
         plan = strides(side)

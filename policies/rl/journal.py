@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from stable_baselines3.common.monitor import Monitor
 
+from hvs_suite.policies.rl.guide import GUIDED, Guide, Guided
 from hvs_suite.tasks.shared.spec import Spec
 
 SCENES_A_SEED = 10**9
@@ -71,7 +72,9 @@ class Journal(gymnasium.Wrapper[Any, Any, Any, Any]):
         return observation, reward, terminated, truncated, info
 
 
-def make_journal(spec: Spec, options: Mapping[str, Any], split: str, seed: int) -> Journal:
+def make_journal(
+    spec: Spec, options: Mapping[str, Any], split: str, seed: int, guide: Guide | None = None
+) -> Journal:
     """Makes the Gymnasium environment of a named task, monitored and with a journal.
 
     Args:
@@ -79,12 +82,17 @@ def make_journal(spec: Spec, options: Mapping[str, Any], split: str, seed: int) 
         options: Task options that differ from it.
         split: Stream of scenes.
         seed: Of the run.
+        guide: Plays some of the episodes; None for none.
     """
-    env = gymnasium.make(
+    env: gymnasium.Env[Any, Any] = gymnasium.make(
         f"hvs_suite/{spec.name}-v{spec.version}",
         disable_env_checker=True,
         split=split,
         **options,
     )
+    outcomes: tuple[str, ...] = OUTCOMES
+    if guide is not None:
+        env = Guided(env, guide, seed)
+        outcomes = (*OUTCOMES, GUIDED)
     # The monitor inside: it sees the steps that a restored journal plays again.
-    return Journal(Monitor(env, info_keywords=OUTCOMES), seed)
+    return Journal(Monitor(env, info_keywords=outcomes), seed)

@@ -20,6 +20,7 @@ from stable_baselines3.common.logger import Logger
 from hvs_suite.files import replacing
 from hvs_suite.policies.rl.curves import LoggedCurves
 from hvs_suite.policies.rl.evaluation import Evaluator, read_evaluations, write_evaluations
+from hvs_suite.policies.rl.guide import GUIDED
 from hvs_suite.policies.rl.journal import OUTCOMES
 from hvs_suite.policies.rl.outcome import Outcome, Progress
 from hvs_suite.policies.rl.plot import draw_rl_run
@@ -164,7 +165,8 @@ class Run:
         model = self._model
         recent = list(model.ep_info_buffer or ())
         ends = [{**episode, **episode["errors"]} for episode in recent]
-        for name in (*OUTCOMES[:-1], *recent[0]["errors"]) if recent else ():
+        guided = [GUIDED] if recent and GUIDED in recent[0] else []
+        for name in (*OUTCOMES[:-1], *guided, *recent[0]["errors"]) if recent else ():
             value = sum(float(end[name]) for end in ends) / len(ends)
             model.logger.record(f"rollout/{name}", value)
         model.logger.record(

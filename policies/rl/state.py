@@ -8,6 +8,7 @@ writes those since the last one, as ``replay/<first>-<end>.npz``, and drops what
 import dataclasses
 import json
 from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,7 @@ def save_run(folder: Path, model: SAC, counters: Counters) -> None:
         "numpy_rng": [rng[0], rng[1].tolist(), *rng[2:]],
         "action_rng": model.action_space.np_random.bit_generator.state,
     }
-    tensors = {name: value.detach().cpu().contiguous() for name, value in _tensors(model).items()}
+    tensors = unshared(_tensors(model))
     with replacing(folder / STATE) as temporary:
         temporary.write_bytes(save(tensors, {"state": json.dumps(header)}))
     _forget_rows(folder / REPLAY, stored, _memory(model).buffer_size)
@@ -113,6 +114,21 @@ def load_run(folder: Path, model: SAC) -> Counters:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise OutputError(f"{path} cannot be resumed ({reason}); name another --out") from error
     return counters
+
+
+def unshared(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors as safetensors takes them: on the CPU, in one piece, each with memory of its own.
+
+    Args:
+        tensors: By name; networks that share a part name it twice.
+    """
+    taken: set[int] = set()
+    found: dict[str, Tensor] = {}
+    for name, value in tensors.items():
+        own = value.detach().cpu().contiguous()
+        found[name] = own.clone() if own.data_ptr() in taken else own
+        taken.add(own.data_ptr())
+    return found
 
 
 def _memory(model: SAC) -> DictReplayBuffer:

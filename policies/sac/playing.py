@@ -26,6 +26,7 @@ from hvs_suite.policies.checkpoints.files import (
     read_settings,
     read_shapes,
 )
+from hvs_suite.policies.sac.settings import EyeKind, Settings
 from hvs_suite.policies.trained_for import TrainedFor, check_trained_for, trained_for
 from hvs_suite.rollout import Observation, one_torch_thread
 from hvs_suite.tasks.shared.spec import Spec
@@ -72,12 +73,25 @@ class Config(TrainedFor):
         action_mode: What the actor commands.
         inputs: What it reads, by name.
         hidden: Widths of the dense layers.
+        eyes: As in `Settings`.
+        eye_channels: Channels of pretrained eyes.
     """
 
     type: Literal["hvs_sac"]
     action_mode: str
     inputs: Annotated[dict[str, Input], pydantic.Field(min_length=1, max_length=8)]
     hidden: Annotated[list[Size], pydantic.Field(max_length=16)]
+    eyes: EyeKind = "apart"
+    eye_channels: Size | None = None
+
+    @pydantic.model_validator(mode="after")
+    def _has_eyes(self) -> "Config":
+        if (self.eyes == "pretrained") != (self.eye_channels is not None):
+            raise ValueError("pretrained eyes have eye_channels, and others have none")
+        channels = {part.shape[0] for part in self.inputs.values() if part.shape is not None}
+        if self.eyes == "shared" and len(channels) > 1:
+            raise ValueError("shared eyes read images with the same number of channels")
+        return self
 
 
 class Stage(Protocol):
@@ -159,7 +173,11 @@ def is_sac(folder: Path) -> bool:
 
 
 def write_config(
-    folder: Path, spec: Spec, observation_space: spaces.Dict, hidden: tuple[int, ...]
+    folder: Path,
+    spec: Spec,
+    observation_space: spaces.Dict,
+    settings: Settings,
+    eye_channels: int | None,
 ) -> None:
     """Write what is needed to make the actor again.
 
@@ -167,7 +185,8 @@ def write_config(
         folder: The checkpoint.
         spec: Task that is learnt, its options included.
         observation_space: Images (C, H, W) uint8 and joint inputs (7,) by name.
-        hidden: Widths of the dense layers.
+        settings: Of SAC.
+        eye_channels: Channels of pretrained eyes; None without them.
     """
     inputs = {
         name: {"shape": list(space.shape or ())}
@@ -182,7 +201,9 @@ def write_config(
         **trained_for(spec).model_dump(),
         "action_mode": spec.action_mode,
         "inputs": inputs,
-        "hidden": list(hidden),
+        "hidden": list(settings.hidden),
+        "eyes": settings.eyes,
+        "eye_channels": eye_channels,
     }
     with replacing(folder / CONFIG) as temporary:
         temporary.write_text(json.dumps(content, indent=2) + "\n")
@@ -269,9 +290,13 @@ def _load_actor(folder: Path, config: Config) -> "Actor":
     space = spaces.Dict({name: _space(part) for name, part in config.inputs.items()})
     n_actions = 6 if config.action_mode == "flange_twist" else 7
     action_space = spaces.Box(-1.0, 1.0, (n_actions,), np.float32)
-    check_weights(folder, lambda: make_actor(space, action_space, config.hidden))
+
+    def make() -> "Actor":
+        return make_actor(space, action_space, config.hidden, config.eyes, config.eye_channels or 0)
+
+    check_weights(folder, make)
     try:
-        actor = make_actor(space, action_space, config.hidden)
+        actor = make()
         actor.load_state_dict(load_file(folder / WEIGHTS))
     except (SafetensorError, OSError, RuntimeError) as error:
         raise PolicyError(

@@ -2,8 +2,12 @@
 
 import dataclasses
 import math
+from typing import Literal, get_args
 
 from hvs_suite.errors import OptionError
+from hvs_suite.tasks.shared.option_types import in_words
+
+EyeKind = Literal["apart", "shared", "pretrained"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -29,6 +33,12 @@ class Settings:
         collect_steps: Environment steps an iteration.
         updates: Updates after an iteration, once learning has started.
         hidden: Widths of the dense layers behind the joined sub-networks.
+        eyes: ``apart``, a network for each image, as the thesis has it; ``shared``, both images
+            through one network; ``pretrained``, the eyes of the weights shipped for the task, which
+            are not trained further: what they say of the target goes through two dense layers, as
+            a joint input does.
+        shared_trunk: Let actor and critics share their sub-networks. As SB3 has it, only the
+            actor's loss trains them then.
     """
 
     learning_rate: float = 3e-4
@@ -40,6 +50,8 @@ class Settings:
     collect_steps: int = 20
     updates: int = 1
     hidden: tuple[int, ...] = (256, 256)
+    eyes: EyeKind = "apart"
+    shared_trunk: bool = False
 
     def __post_init__(self) -> None:
         """Refuse values that make no sense.
@@ -54,6 +66,8 @@ class Settings:
         for name in ("batch_size", "replay_size", "collect_steps", "updates"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if self.eyes not in get_args(EyeKind):
+            raise OptionError(f"eyes must be {in_words(EyeKind)}, not {self.eyes!r}")
         if self.random_steps < 0:
             raise OptionError(f"random_steps must be 0 or more, not {self.random_steps}")
         if not self.hidden or min(self.hidden) < 1:

@@ -9,14 +9,17 @@ import dataclasses
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from gymnasium import spaces
 from stable_baselines3 import SAC
 
-from hvs_suite.errors import OptionError
+from hvs_suite.errors import OptionError, PolicyError
+from hvs_suite.policies.belief.eye import Eye
+from hvs_suite.policies.checkpoints.loading import load_network, weights_digest
 from hvs_suite.policies.rl.evaluation import Evaluator
+from hvs_suite.policies.rl.guide import Guide, PlayedActions
 from hvs_suite.policies.rl.journal import Journal, make_journal
 from hvs_suite.policies.rl.outcome import Outcome, Progress, check_run
 from hvs_suite.policies.rl.run import Run
@@ -35,7 +38,7 @@ from hvs_suite.tasks.shared.spec import (
 )
 
 PACKAGES = ("hvs-suite", "mujoco", "numpy", "stable-baselines3", "torch")
-INPUTS = PRESETS["vision"]
+INPUTS = (*PRESETS["vision"], "joint_torques")
 
 
 def train_sac(
@@ -46,6 +49,8 @@ def train_sac(
     steps: int | None = None,
     seed: int = 0,
     settings: Settings | None = None,
+    eyes_of: Path | None = None,
+    guide: Guide | None = None,
     rewards: Sequence[str] = THESIS_REWARDS,
     options: Mapping[str, Any] | None = None,
     split: str = "train",
@@ -66,6 +71,10 @@ def train_sac(
             or both for the first reached.
         seed: Of weights, scenes, exploration and batches; below 2^32.
         settings: Of SAC; the thesis's by default.
+        eyes_of: Checkpoint of an `hvs` policy whose eyes are to be used, where the settings have
+            them pretrained.
+        guide: Policy that plays some of the episodes, so that the replay memory holds what
+            exploration would not find; None for exploration alone.
         rewards: Reward terms to learn from, as the task's option of that name.
         options: Further task options, for studies.
         split: Stream of scenes to learn from; anything but ``test``.
@@ -81,6 +90,7 @@ def train_sac(
     Raises:
         UnknownTaskError: There is no such task.
         OptionError: No budget, or a value that makes no sense.
+        PolicyError: The eyes are for other pictures, or the guide cannot play the task.
         OutputError: ``out`` cannot be written, or holds something else than this run.
     """
     settings = settings or Settings()
@@ -88,7 +98,12 @@ def train_sac(
     options = options_of(spec)
     limit = Budget(steps, minutes)
     check_run(seed, split, eval_every, eval_episodes)
-    _check(spec, device)
+    _check(spec, settings, device)
+    if (settings.eyes == "pretrained") != (eyes_of is not None):
+        raise OptionError(
+            "name the checkpoint whose eyes to use with pretrained eyes, and only then"
+        )
+    trained = {} if eyes_of is None else _trained_eyes(eyes_of, spec)
     prepare_process()
     identity = {
         "task": task,
@@ -96,6 +111,8 @@ def train_sac(
         "options": options,
         "split": split,
         "seed": seed,
+        "eyes_of": None if eyes_of is None else weights_digest(eyes_of),
+        "guide": None if guide is None else [guide.name, guide.share],
         **json.loads(json.dumps(dataclasses.asdict(settings))),
     }
     with contextlib.ExitStack() as stack:
@@ -104,10 +121,13 @@ def train_sac(
         write_train_config(out, identity, budget, PACKAGES, device=device)
         # SB3 draws from the global generators of NumPy and torch.
         stack.enter_context(library_seeds(seed))
-        journal = stack.enter_context(contextlib.closing(make_journal(spec, options, split, seed)))
-        model = _make_model(journal, settings, seed, device)
+        journal = stack.enter_context(
+            contextlib.closing(make_journal(spec, options, split, seed, guide))
+        )
+        model = _make_model(journal, settings, trained, seed, device)
         assert isinstance(model.observation_space, spaces.Dict)
-        write_config(out, spec, model.observation_space, settings.hidden)
+        channels = next((eye.channels for eye in trained.values()), None)
+        write_config(out, spec, model.observation_space, settings, channels)
         evaluator = stack.enter_context(contextlib.closing(Evaluator(spec, options, eval_episodes)))
         run = Run(out, _Sac(out, model), evaluator, on_progress)
         stack.callback(run.close)
@@ -131,10 +151,30 @@ class _Sac:
         save_actor(self._out, self.model.actor)
 
 
-def _make_model(journal: Journal, settings: Settings, seed: int, device: str) -> SAC:
+def _trained_eyes(folder: Path, spec: Spec) -> dict[str, Eye]:
+    """The eye of each picture that a task shows, by name, from an `hvs` checkpoint."""
+    network = load_network(folder)
+    if network.shape.n_goals:
+        raise PolicyError(f"the eyes of {folder} have to be told which target is meant")
+    found: dict[str, Eye] = {}
+    for name in (name for name in spec.observed if name in ("eih", "eth")):
+        shown = getattr(spec, f"{name}_channels"), getattr(spec, f"{name}_resolution")
+        if network.shape.cameras.get(name) != shown:
+            raise PolicyError(
+                f"the eyes of {folder} do not take {name} with {shown[0]} channels and "
+                f"{shown[1]} px, as {spec.name} shows it"
+            )
+        found[name] = cast(Eye, network.eyes[name])
+    return found
+
+
+def _make_model(
+    journal: Journal, settings: Settings, trained: Mapping[str, Eye], seed: int, device: str
+) -> SAC:
     return SAC(
         "MultiInputPolicy",
         journal,
+        replay_buffer_class=PlayedActions,
         learning_rate=settings.learning_rate,
         buffer_size=settings.replay_size,
         learning_starts=settings.random_steps,
@@ -144,13 +184,17 @@ def _make_model(journal: Journal, settings: Settings, seed: int, device: str) ->
         train_freq=(settings.collect_steps, "step"),
         gradient_steps=settings.updates,
         target_update_interval=1,
-        policy_kwargs=policy_kwargs(list(settings.hidden)),
+        policy_kwargs=policy_kwargs(settings, trained),
         seed=seed,
         device=device,
     )
 
 
-def _check(spec: Spec, device: str) -> None:
+def _check(spec: Spec, settings: Settings, device: str) -> None:
+    if settings.eyes == "shared" and (
+        not {"eih", "eth"} <= set(spec.observed) or spec.eih_channels != spec.eth_channels
+    ):
+        raise OptionError("shared eyes need both pictures, with the same number of channels")
     others = [name for name in spec.observed if name not in INPUTS]
     if others or spec.normalise_observation:
         raise OptionError(

@@ -29,8 +29,17 @@ from hvs_suite.cell.robot import (
 from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared import actions, appearance, observations, rewards
 from hvs_suite.tasks.shared.family import Family, Progress
-from hvs_suite.tasks.shared.goal import LATERAL, POSITION, TILT, Goal, Keypoint, Tip, goal_errors
-from hvs_suite.tasks.shared.scenario import Scenario, ScenarioSource
+from hvs_suite.tasks.shared.goal import (
+    HEIGHT,
+    LATERAL,
+    POSITION,
+    TILT,
+    Goal,
+    Keypoint,
+    Tip,
+    goal_errors,
+)
+from hvs_suite.tasks.shared.scenario import Scenario, ScenarioSource, StepStream
 from hvs_suite.tasks.shared.spec import CAMERA_NAMES, Spec
 from hvs_suite.tasks.shared.strewn import Strewn
 
@@ -95,6 +104,7 @@ class ArmTask(composer.Task):
         family.build(self._cell)
         self._strewn = Strewn(self._cell, spec) if spec.n_strewn else None
         self.source = ScenarioSource(spec, family.named, split, family.draw)
+        self._action_noise = StepStream(self.source, "noise-action")
         self.time_limit_steps = spec.time_limit_steps
         self.camera_side = max(spec.eih_resolution, spec.eth_resolution)
         self.multisampling = spec.multisampling
@@ -109,7 +119,7 @@ class ArmTask(composer.Task):
         self._observables = observations.make_observables(self)
         self._bounded = tuple(m for m in spec.metrics if m.over == "step" and m.bound is not None)
         self.slack = {}
-        self._is_shaped = bool({"position", "rotation", "exponential"} & set(spec.rewards))
+        self._is_shaped = bool(rewards.OF_ERRORS & set(spec.rewards))
         self._scenario: Scenario | None = None
         self._goal_configurations: FloatArray | None = None
         self._errors: dict[str, float] = {}
@@ -222,6 +232,10 @@ class ArmTask(composer.Task):
             action, spec.action_mode, clip=self.environment.clip_actions
         )
         self._n_clipped += clipped
+        if spec.action_noise > 0:
+            random = self._action_noise.at(self.scenario.index, self.environment.control_steps)
+            values = values + spec.action_noise * random.normal(size=values.shape)
+            values = np.clip(values, -1.0, 1.0)
         self._commanded = actions.set_point(
             values, spec.action_mode, self._commanded, spec.control_period_s
         )
@@ -291,10 +305,11 @@ class ArmTask(composer.Task):
 
     def _step_outcome(self, physics: mjcf.Physics) -> rewards.StepOutcome:
         """What the rewards of the control step depend on; costly parts only where asked for."""
-        distance_m = tilt_deg = joint_distance = None
+        distance_m = lateral_m = height_m = tilt_deg = joint_distance = None
         if self._is_shaped:
             errors = goal_errors(self.tip(physics), self.goal())
             distance_m, tilt_deg = errors[POSITION] / 1000.0, errors[TILT]
+            lateral_m, height_m = errors[LATERAL] / 1000.0, abs(errors[HEIGHT]) / 1000.0
         if self._goal_configurations is not None:
             joint_distance = rewards.joint_distance(
                 self.joint_positions(physics), self._goal_configurations
@@ -304,6 +319,8 @@ class ArmTask(composer.Task):
             collision=self._collision,
             truncated=self._truncated,
             distance_m=distance_m,
+            lateral_m=lateral_m,
+            height_m=height_m,
             tilt_deg=tilt_deg,
             joint_distance=joint_distance,
         )
@@ -466,6 +483,20 @@ class ArmTask(composer.Task):
     def joint_velocities(self, physics: mjcf.Physics) -> FloatArray:
         """True joint speeds, (7,) rad/s."""
         return np.asarray(physics.data.ptr.qvel[self._qvel])
+
+    def joint_torques(self, physics: mjcf.Physics) -> FloatArray:
+        """Torques of the drives about the joints' axes, (7,) N m: they carry and move the arm.
+
+        What the torque sensors of an iiwa show, which sit between gear and link: the weight, the
+        motion and what the arm presses against, all together, within the published 176, 176, 110,
+        110, 110, 40 and 40 N m. They are not the *external* torques that KUKA's controller derives
+        from them by a model of the arm. Real sensors do not show what speeds the rotors up, which
+        is in ours (0.1 kg m^2 times the acceleration: at most 1.4 N m at the published ones), and
+        have noise, which ours have not.
+        """
+        # MuJoCo has them of before the last substep; the next substep computes them anew.
+        mujoco.mj_fwdActuation(physics.model.ptr, physics.data.ptr)
+        return np.asarray(physics.data.ptr.qfrc_actuator[self._qvel])
 
     def flange_position(self, physics: mjcf.Physics) -> FloatArray:
         """True position of the flange face's centre, (3,) m, base frame."""

@@ -16,7 +16,7 @@ from dm_env import specs
 from scipy.ndimage import gaussian_filter
 
 from hvs_suite.cell import cameras
-from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
+from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S, JOINT_TORQUE_NM
 from hvs_suite.tasks.shared import depth_noise
 from hvs_suite.tasks.shared.scenario import StepStream
 
@@ -31,6 +31,12 @@ SPEED_BOUND_RAD_S = 2.0 * JOINT_SPEED_RAD_S
 """Where measured joint speeds saturate. An arm whose set point jumps to and fro falls behind at its
 torque limit and catches up faster than the set point moves; measurements still keep their bounds.
 """
+FULL_SCALE = {
+    "joint_positions": JOINT_RANGE_RAD,
+    "joint_velocities": JOINT_SPEED_RAD_S,
+    "joint_torques": JOINT_TORQUE_NM,
+}
+"""What reads as 1 where observations are normalised: the robot's published limits."""
 DEPTH_BOUND_M = 20.0
 _STATE_BOUND_M = 3.0
 # One bank of unit noise, cut into frames at random places, costs a tenth of drawing it anew.
@@ -95,7 +101,8 @@ def make_observables(task: "ArmTask") -> dict[str, observable.Observable]:
     Returns:
         Observables by name: ``eih``, ``eth`` uint8 (H, W, C); ``eih_depth``, ``eth_depth`` float32
         (H, W, 1) m, 0 where a noisy one has no measurement; ``joint_positions`` (7,) rad,
-        ``joint_velocities`` (7,) rad/s, as measured; privileged: ``flange_position``,
+        ``joint_velocities`` (7,) rad/s, ``joint_torques`` (7,) N m (see
+        ``ArmTask.joint_torques``), as measured; privileged: ``flange_position``,
         ``goal_position`` (3,) m, ``goal_normal`` (3,); and what the family adds. With
         ``normalise_observation`` pictures are float32 in [0, 1] and joints in [-1, 1].
     """
@@ -169,13 +176,14 @@ def _vector(task: "ArmTask", name: str) -> VectorObservable:
     reads: dict[str, tuple[Callable[[mjcf.Physics], FloatArray], FloatArray]] = {
         "joint_positions": (task.measured_positions, POSITION_BOUND_RAD),
         "joint_velocities": (task.joint_velocities, SPEED_BOUND_RAD_S),
+        "joint_torques": (task.joint_torques, JOINT_TORQUE_NM),
         "flange_position": (task.flange_position, np.full(3, _STATE_BOUND_M)),
         "goal_position": (lambda physics: task.goal().position, np.full(3, _STATE_BOUND_M)),
         "goal_normal": (lambda physics: task.goal().normal, np.ones(3)),
     }
     read, bound = reads[name]
-    if task.spec.normalise_observation and name.startswith("joint_"):
-        scale = JOINT_RANGE_RAD if name == "joint_positions" else JOINT_SPEED_RAD_S
+    if task.spec.normalise_observation and name in FULL_SCALE:
+        scale = FULL_SCALE[name]
 
         def normalised(physics: mjcf.Physics) -> FloatArray:
             return np.minimum(np.maximum(read(physics) / scale, -1.0), 1.0)

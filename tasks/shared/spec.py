@@ -27,7 +27,15 @@ if TYPE_CHECKING:
 Start = Literal["zero", "random", "fixed", "near_goal", "mixed"] | tuple[float, ...]
 ActionMode = Literal["joint_position", "joint_delta", "joint_velocity", "flange_twist"]
 RewardTerm = Literal[
-    "goal", "collision", "time", "position", "rotation", "joint_space", "exponential"
+    "goal",
+    "collision",
+    "time",
+    "position",
+    "lateral",
+    "height",
+    "rotation",
+    "joint_space",
+    "exponential",
 ]
 
 PRESETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
@@ -43,7 +51,7 @@ PRESETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     }
 )
 """Observations by preset; ``state`` is privileged and never mixes with pictures."""
-VISION_OBSERVATIONS = (*PRESETS["vision"], "eih_depth", "eth_depth")
+VISION_OBSERVATIONS = (*PRESETS["vision"], "joint_torques", "eih_depth", "eth_depth")
 JOINTS = 7
 JOINT_LIMITS_DEG = (170, 120, 170, 120, 170, 120, 175)
 MAX_RESOLUTION = 2048
@@ -135,6 +143,10 @@ class Disturbances:
         image_noise: Standard deviation of pixel noise (grey levels of 255).
         image_blur_px: Standard deviation of the Gaussian that pictures are blurred with (px).
         joint_offset_deg: Standard deviation of the encoder zero error (deg), cut at 2 sigma.
+        action_noise: Standard deviation of the noise on each number of an action, whose full scale
+            is 1: a fraction of the joint's range, of 0.1 rad, of the joint's speed, or of 0.5 m/s
+            and 1.5 rad/s, by the action mode. Each control step of a scene has noise of its own,
+            and what is commanded stays in [-1, 1].
         depth_noise_px: Standard deviation of the disparities behind depth pictures (px of a sensor
             640 px wide), which then have steps and holes as well; 0 for true depth.
         n_strewn: Things that lie around and are not the target: discs of other colours, red squares
@@ -158,6 +170,7 @@ class Disturbances:
     image_noise: float = scene(0.0)
     image_blur_px: float = 0.0
     joint_offset_deg: float = scene(0.0)
+    action_noise: float = 0.0
     depth_noise_px: float = 0.0
     n_strewn: int = scene(0)
     unannounced: bool = False
@@ -213,7 +226,8 @@ class Spec(Timing, Cameras, Disturbances):
             a few centimetres and degrees from the goal pose; ``mixed``, half the task's ``zero``
             or ``random`` start, half ``near_goal``; or seven angles (rad).
         observations: Preset, or names joined by ``+``: ``eih``, ``eth``, ``eih_depth``,
-            ``eth_depth``, ``joint_positions``, ``joint_velocities``, and what the family adds
+            ``eth_depth``, ``joint_positions``, ``joint_velocities``, ``joint_torques`` (what the
+            drives exert, N m, the arm's weight included), and what the family adds
             (``further_observations``), which presets show as well.
         normalise_observation: Images to [0, 1] and joints to [-1, 1], as in the thesis.
         action_mode: Meaning of the seven (``flange_twist``: six) action numbers.
@@ -262,6 +276,7 @@ class Spec(Timing, Cameras, Disturbances):
             "image_noise",
             "image_blur_px",
             "joint_offset_deg",
+            "action_noise",
             "depth_noise_px",
             "n_strewn",
         )
@@ -430,6 +445,7 @@ class Spec(Timing, Cameras, Disturbances):
             "image noise": self.image_noise > 0,
             "blur": self.image_blur_px > 0,
             "joint offsets": self.joint_offset_deg > 0,
+            "action noise": self.action_noise > 0,
             "latency": self.latency_steps > 0,
             "depth noise": self.depth_noise_px > 0,
         }

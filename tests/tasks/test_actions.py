@@ -160,6 +160,49 @@ def test_latency_delays_an_action_by_whole_steps(latency: int) -> None:
         assert len(late.pending_setpoints) == latency
 
 
+@pytest.mark.parametrize(
+    ("mode", "full_scale"),
+    [
+        ("joint_position", JOINT_RANGE_RAD),
+        ("joint_delta", np.full(7, JOINT_DELTA_RAD)),
+        ("joint_velocity", 0.1 * JOINT_SPEED_RAD_S),
+    ],
+)
+def test_noise_on_actions_has_the_asked_strength_and_is_its_scene_s_own(
+    mode: str, full_scale: npt.NDArray[np.float64]
+) -> None:
+    env = bent(mode, action_noise=0.01)
+    stay = np.array(BENT) / JOINT_RANGE_RAD if mode == "joint_position" else np.zeros(7)
+
+    def noise(scenario: int) -> npt.NDArray[np.float64]:
+        env.reset(scenario=scenario)
+        shown = [np.array(BENT)]
+        for _ in range(60):
+            env.step(stay)
+            shown.append(env.setpoint)
+        steps = np.array(shown)
+        off = steps[1:] - BENT if mode == "joint_position" else np.diff(steps, axis=0)
+        return off / full_scale
+
+    first = noise(0)
+    assert first.std() == pytest.approx(0.01, rel=0.1)
+    assert abs(first.mean()) < 0.002
+    # The same actions in the same scene do the same, so that an episode can be played again.
+    np.testing.assert_array_equal(noise(0), first)
+    assert np.abs(noise(1) - first).max() > 0.005
+
+
+def test_noise_on_actions_leaves_the_scene_and_the_range_of_actions() -> None:
+    with bent("joint_position") as quiet, bent("joint_position", action_noise=0.5) as noisy:
+        assert noisy.scenario.digest() == quiet.scenario.digest()
+        assert noisy.spec.describe().disturbances == "action noise"
+        for _ in range(30):
+            noisy.step(np.ones(7) * 0.99)
+            assert (np.abs(noisy.setpoint) <= JOINT_RANGE_RAD).all()
+            if noisy.info["collision"]:
+                break
+
+
 @pytest.mark.each_task("align-drill", "sequence-hard", "track-hard")
 def test_tasks_answer_as_late_as_they_say(named: Named, task: str) -> None:
     env = named(task, "state")

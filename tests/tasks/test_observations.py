@@ -4,11 +4,12 @@ import itertools
 from collections.abc import Callable
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 
 import hvs_suite
-from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S
+from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S, JOINT_TORQUE_NM, robot_mjcf
 from hvs_suite.tasks.shared.environment import Environment
 from hvs_suite.tasks.shared.observations import NoiseBank
 
@@ -139,6 +140,49 @@ def test_joint_velocities_are_those_of_the_motion(named: Named) -> None:
     rate = (seen[3]["joint_positions"][0] - seen[2]["joint_positions"][0]) / 0.1
     assert rate == pytest.approx(np.deg2rad(98), rel=0.01)
     assert seen[3]["joint_velocities"][0] == pytest.approx(np.deg2rad(98), rel=0.01)
+
+
+def played(observations: str, **options: Any) -> list[dict[str, Any]]:
+    """What is seen on the way to a bent posture, and at rest there."""
+    with hvs_suite.load(
+        "align-thesis", observations=observations, eih_resolution=8, time_limit_steps=40, **options
+    ) as env:
+        goal = np.deg2rad([60, 60, 0, -70, 0, 50, 0])
+        steps = [env.reset(scenario=0)]
+        steps += [env.step(env.commandable(goal)) for _ in range(20)]
+        for name, spec in env.observation_spec().items():
+            for time_step in steps:
+                spec.validate(time_step.observation[name])
+        return [dict(time_step.observation) for time_step in steps]
+
+
+def test_joint_torques_carry_the_arm_and_move_it() -> None:
+    seen = [step["joint_torques"] for step in played("eih+joint_torques")]
+    # The upright arm weighs on no joint.
+    np.testing.assert_allclose(seen[0], 0.0, atol=1e-9)
+    model = mujoco.MjModel.from_xml_string(robot_mjcf())
+    data = mujoco.MjData(model)
+    data.qpos[:7] = np.deg2rad([60, 60, 0, -70, 0, 50, 0])
+    mujoco.mj_forward(model, data)
+    weight = data.qfrc_bias[:7]
+    assert abs(weight[1]) > 40.0
+    np.testing.assert_allclose(seen[-1], weight, atol=0.05)
+    # To start turning takes torque about the first axis, on which no weight ever lies.
+    assert seen[1][0] > 5.0
+
+
+def test_joint_torques_have_the_robot_s_limits_as_their_full_scale() -> None:
+    raw = np.array([step["joint_torques"] for step in played("eih+joint_torques")])
+    scaled = played("eih+joint_torques", normalise_observation=True)
+    np.testing.assert_allclose(
+        [step["joint_torques"] for step in scaled], raw / JOINT_TORQUE_NM, atol=1e-6
+    )
+
+
+def test_measuring_torques_changes_nothing_else() -> None:
+    told, plain = played("eih+joint_positions+joint_torques"), played("eih+joint_positions")
+    for one, other in zip(told, plain, strict=True):
+        np.testing.assert_array_equal(one["joint_positions"], other["joint_positions"])
 
 
 def test_measurements_stay_within_their_bounds_at_full_speed() -> None:

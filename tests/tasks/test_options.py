@@ -82,6 +82,7 @@ def test_an_unknown_task_is_refused_with_the_nearest_names(name: str, hint: str)
         ({"eth_position_m": (0.1, 0.1, 3.0), "eth_look_at_m": (0.1, 0.1, 0.0)}, "straight above"),
         ({"eth_position_m": (0.1, 0.1)}, "eth_position_m is"),
         ({"image_noise": -1.0}, "cannot be negative"),
+        ({"action_noise": -0.1}, "action_noise is -0.1; it cannot be negative"),
         ({"joint_offset_deg": math.inf}, "joint_offset_deg is inf"),
         ({"latency_steps": -1}, "latency_steps is -1"),
         ({"vary_light": 1}, "vary_light is 1"),

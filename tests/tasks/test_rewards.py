@@ -1,4 +1,4 @@
-"""Reward terms: the thesis's five and two shapings, each switched alone, and their formulas."""
+"""Reward terms: the thesis's five and four shapings, each switched alone, and their formulas."""
 
 import dataclasses
 import math
@@ -18,10 +18,18 @@ ON_THE_WAY = StepOutcome(
     collision=False,
     truncated=False,
     distance_m=0.3,
+    lateral_m=0.18,
+    height_m=0.24,
     tilt_deg=40.0,
     joint_distance=0.2,
 )
-ALL: tuple[RewardTerm, ...] = (*THESIS_REWARDS, "joint_space", "exponential")
+ALL: tuple[RewardTerm, ...] = (
+    *THESIS_REWARDS,
+    "lateral",
+    "height",
+    "joint_space",
+    "exponential",
+)
 
 
 def spec(*rewards: RewardTerm, time_limit: str = "soft") -> Spec:
@@ -40,6 +48,8 @@ def test_each_term_switches_alone() -> None:
     values = {
         "time": -0.05,
         "position": 0.4 * (1.559 - 0.3) / 1.559,
+        "lateral": 0.4 * (1.559 - 0.18) / 1.559,
+        "height": 0.4 * (1.559 - 0.24) / 1.559,
         "rotation": 0.4 * (179.0 - 40.0) / 179.0,
         "joint_space": 0.4 * 0.8,
         "exponential": 0.4 * math.exp(-6.0),
@@ -105,6 +115,22 @@ def test_rotation_pays_in_full_within_tolerance_and_falls_linearly(
     assert terms["rotation"] == pytest.approx(0.4 * share)
 
 
+@pytest.mark.parametrize(
+    ("task", "lateral_m", "height_m"),
+    [("align-thesis", 0.001, 0.001), ("align-drill", 0.00025, 0.001)],
+)
+def test_lateral_and_height_each_pay_in_full_within_their_own_tolerance(
+    task: str, lateral_m: float, height_m: float
+) -> None:
+    chosen = dataclasses.replace(hvs_suite.TASKS[task], rewards=("lateral", "height"))
+    for lateral, height in ((lateral_m, 0.3), (0.3, height_m)):
+        terms = reward_terms(chosen, outcome(lateral_m=lateral, height_m=height))
+        assert (terms["lateral"] == 0.4, terms["height"] == 0.4) == (lateral < 0.3, height < 0.3)
+        beyond = reward_terms(chosen, outcome(lateral_m=1.1 * lateral, height_m=1.1 * height))
+        assert beyond["lateral"] < terms["lateral"]
+        assert beyond["height"] < terms["height"]
+
+
 def test_exponential_falls_to_one_eth_at_50_mm() -> None:
     at = [
         reward_terms(spec("exponential"), outcome(distance_m=d))["exponential"]
@@ -133,6 +159,11 @@ def test_scoring_is_sparse_by_default() -> None:
     assert all(v.rewards == ("goal", "collision") for v in hvs_suite.TASKS.values())
 
 
+def linear(error_mm: float, tolerance_mm: float) -> float:
+    length = 2 * 780 - tolerance_mm
+    return 0.4 if error_mm <= tolerance_mm else 0.4 * (length - error_mm) / length
+
+
 @pytest.mark.parametrize("task", ["align-thesis", "align-drill"])
 def test_the_environment_pays_what_the_formulas_say(task: str) -> None:
     """On the way to the goal, step by step, with every term on."""
@@ -143,16 +174,18 @@ def test_the_environment_pays_what_the_formulas_say(task: str) -> None:
         goal = env.commandable(posture_at(0.6, 0.1, 0.05))
         family = kinematics().goal_configurations([0.6, 0.1, 0.05], [0, 0, 1.0])
         tolerance = env.spec.position_tolerance_mm or env.spec.lateral_tolerance_mm
-        length = 2 * 0.78 - tolerance / 1000
+        height_tolerance = env.spec.height_tolerance_mm or tolerance
         angle = 180.0 - env.spec.tilt_tolerance_deg
         time_step = env.step(goal)
         paid = []
         while not time_step.last():
-            info, d = env.info, env.info["errors"]["position_error_mm"] / 1000
-            a = info["errors"]["tilt_error_deg"]
+            errors = env.info["errors"]
+            d, a = errors["position_error_mm"] / 1000, errors["tilt_error_deg"]
             expected = {
                 "time": -0.05,
-                "position": 0.4 if 1000 * d <= tolerance else 0.4 * (length - d) / length,
+                "position": linear(1000 * d, tolerance),
+                "lateral": linear(errors["lateral_error_mm"], tolerance),
+                "height": linear(errors["height_error_mm"], height_tolerance),
                 "rotation": 0.4 if a <= 180 - angle else 0.4 * (angle - a) / angle,
                 "joint_space": 0.4 * (1 - joint_distance(env.joint_positions, family)),
                 "exponential": 0.4 * math.exp(-d / 0.05),
