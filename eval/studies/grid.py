@@ -55,6 +55,7 @@ class Cell:
         group: Cells that stand in one table, such as those of a task.
         against: The cell of its group that it is compared with; None for one that others are
             compared with.
+        seeds: Its own; None for the plan's.
     """
 
     name: str
@@ -62,6 +63,7 @@ class Cell:
     on: Sequence[Scenes]
     group: str
     against: str | None = None
+    seeds: Sequence[int] | None = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -72,7 +74,7 @@ class Plan:
         name: Of the command.
         question: What it asks.
         cells: Its cells; each stands after the one that it is compared with.
-        seeds: With which each is made.
+        seeds: With how many each is made, from 0 up.
         episodes: Scenes that each policy is judged on.
     """
 
@@ -91,6 +93,14 @@ class Plan:
         for name in ("seeds", "episodes"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}")
+
+    def jobs(self) -> list[tuple[Cell, int]]:
+        """Every cell with each of its seeds."""
+        return [
+            (cell, seed)
+            for cell in self.cells
+            for seed in (range(self.seeds) if cell.seeds is None else cell.seeds)
+        ]
 
     def chosen(self, names: Sequence[str]) -> list[Cell]:
         """Those cells, and what they are compared with.
@@ -297,7 +307,7 @@ def run_grid(
     check_workers(workers)
     chosen = plan.chosen(names)
     make = Maker(out, out.resolve(), plan.episodes)
-    order = [(cell, seed) for cell in plan.cells for seed in range(plan.seeds)]
+    order = plan.jobs()
     found = {_key(*each): make.read(*each) for each in order}
 
     def study() -> Study:

@@ -8,7 +8,7 @@ scenes come to 4 minutes more. So a cell takes 11 and 18 minutes, and the 24 cel
 
 from hvs_suite.eval.studies.grid import Cell, Plan
 from hvs_suite.eval.studies.training import Scenes
-from hvs_suite.eval.studies.ways import Imitation, Recording
+from hvs_suite.eval.studies.ways import TRIAL, Effort, imitation
 
 CAMERAS = {"both cameras": ("eih", "eth"), "eye in hand": ("eih",), "eye to hand": ("eth",)}
 JOINTS = {
@@ -16,6 +16,10 @@ JOINTS = {
     "positions": ("joint_positions",),
     "velocities": ("joint_velocities",),
     "no joints": (),
+}
+EFFORTS = {
+    "align-thesis": Effort(demonstrations=600, steps=3000, dagger_rounds=2),
+    "track-line": Effort(demonstrations=300, steps=4000, dagger_rounds=2),
 }
 WHOLE = "both cameras, positions, velocities"
 
@@ -27,19 +31,15 @@ def plan(*, quick: bool = False) -> Plan:
         quick: Make everything in minutes, of next to no training.
     """
     cells = []
-    for task, episodes, steps in (("align-thesis", 600, 3000), ("track-line", 300, 4000)):
-        data = Recording(task=task, episodes=4 if quick else episodes, options={"start": "mixed"})
+    for task, effort in EFFORTS.items():
         for cameras, eyes in CAMERAS.items():
             for joints, felt in JOINTS.items():
                 name = f"{cameras}, {joints}"
-                settings = {"inputs": (*eyes, *felt), "dagger_rounds": 2, "dagger_frames": 3000}
-                if quick:
-                    settings |= {"dagger_rounds": 1, "dagger_frames": 8, "batch_size": 4}
                 cells.append(
                     Cell(
                         group=task,
                         name=name,
-                        way=Imitation(data=data, steps=2 if quick else steps, settings=settings),
+                        way=imitation(task, TRIAL if quick else effort, inputs=(*eyes, *felt)),
                         on=[Scenes(task=task)],
                         against=None if name == WHOLE else WHOLE,
                     )

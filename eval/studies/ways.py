@@ -11,6 +11,7 @@ import re
 import shlex
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from hvs_suite.eval.studies.training import POLICY, Note
@@ -22,8 +23,8 @@ NOISE_RAD = 0.02
 """As `hvs demo` records: without disturbance and starts near the goal little is learnt."""
 EVERYWHERE_M = 10.0
 """How far from the goal fine-tuning moves it: a weak base may never come near."""
-RL_EPISODES = 100
-"""Scenes of an evaluation before and after RL, by which it keeps the better of the two."""
+RL_STEPS = 16_000
+"""Environment steps of RL in most studies, after which its curves rose little any more."""
 
 type Options = Mapping[str, Any]
 
@@ -131,6 +132,7 @@ class Finetuning:
         settings: Of `hvs_suite.policies.residual.settings.Settings`, where not the study's.
         options: Task options that differ from the named task's.
         curriculum: See `hvs_suite.policies.residual.td3.finetune`.
+        eval_episodes: Scenes of an evaluation at start and end, by which it keeps the better.
     """
 
     base: Imitation
@@ -139,6 +141,7 @@ class Finetuning:
     settings: Options = dataclasses.field(default_factory=dict)
     options: Options = dataclasses.field(default_factory=dict)
     curriculum: Kind | None = None
+    eval_episodes: int = 100
 
     def folder(self, out: Path, seed: int) -> Path:
         """Where a study keeps the run."""
@@ -159,7 +162,7 @@ class Finetuning:
             options=self.options,
             curriculum=self.curriculum,
             eval_every=self.steps,
-            eval_episodes=RL_EPISODES,
+            eval_episodes=self.eval_episodes,
             on_progress=note,
         )
 
@@ -177,7 +180,7 @@ class Finetuning:
             **self._settings(),
             "curriculum": self.curriculum,
             "eval_every": self.steps,
-            "eval_episodes": RL_EPISODES,
+            "eval_episodes": self.eval_episodes,
             "seed": seed,
             "option": self.options,
         }
@@ -192,11 +195,13 @@ class Scratch:
         task: Named task.
         steps: Environment steps.
         settings: Of `hvs_suite.policies.sac.settings.Settings`, where not the thesis's.
+        eval_episodes: Scenes of an evaluation at start and end.
     """
 
     task: str
     steps: int
     settings: Options = dataclasses.field(default_factory=dict)
+    eval_episodes: int = 20
 
     def folder(self, out: Path, seed: int) -> Path:
         """Where a study keeps the run."""
@@ -214,18 +219,74 @@ class Scratch:
             seed=seed,
             settings=Settings(**self.settings),
             eval_every=self.steps,
+            eval_episodes=self.eval_episodes,
             on_progress=note,
         )
 
     def commands(self, out: Path, seed: int) -> Iterator[str]:
         """The command that makes the same policy."""
         words = {"task": self.task, "out": self.folder(out, seed) / POLICY, "steps": self.steps}
-        yield command(
-            "train-sac", {**words, **self.settings, "eval_every": self.steps, "seed": seed}
-        )
+        evaluated = {"eval_every": self.steps, "eval_episodes": self.eval_episodes}
+        yield command("train-sac", {**words, **self.settings, **evaluated, "seed": seed})
 
 
 type Way = Imitation | Finetuning | Scratch
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Effort:
+    """What an imitated policy costs.
+
+    Attributes:
+        demonstrations: Episodes to record.
+        steps: Optimiser steps.
+        dagger_rounds: Rounds of DAgger.
+        dagger_frames: Frames of each.
+        batch_size: Frames that the eyes learn from in a step.
+    """
+
+    demonstrations: int
+    steps: int
+    dagger_rounds: int = 0
+    dagger_frames: int = 3000
+    batch_size: int = 64
+
+
+TRIAL = Effort(demonstrations=4, steps=2, dagger_rounds=1, dagger_frames=8, batch_size=4)
+"""Next to no training, to try a study out."""
+FEW = Effort(demonstrations=50, steps=1000)
+"""What RL begins with in most studies: a policy that solves some scenes."""
+
+
+def imitation(
+    task: str, effort: Effort, options: Options = MappingProxyType({}), **settings: Any
+) -> Imitation:
+    """A policy that learns from a recording of its own.
+
+    Args:
+        task: Named task.
+        effort: What it costs.
+        options: Task options to record with; half of the arms start near the goal if they name no
+            other start.
+        **settings: Of `Imitation`, beside the effort's.
+    """
+    spent = dataclasses.asdict(effort)
+    n, steps = spent.pop("demonstrations"), spent.pop("steps")
+    data = Recording(task=task, episodes=n, options={"start": "mixed", **options})
+    return Imitation(data=data, steps=steps, settings={**spent, **settings})
+
+
+def tuned(base: Imitation, task: str, *, quick: bool, **options: Any) -> Finetuning:
+    """A policy that goes on by RL.
+
+    Args:
+        base: What it begins with.
+        task: Named task.
+        quick: Make next to no training of it.
+        **options: Of `Finetuning`.
+    """
+    way = Finetuning(base=base, task=task, steps=RL_STEPS, **options)
+    return dataclasses.replace(way, steps=40, eval_episodes=2) if quick else way
 
 
 def digest(plan: Any) -> str:

@@ -264,6 +264,12 @@ class Study:
         Annotated[Compression, tyro.conf.subcommand("compression")]
         | Annotated[study_grids.Ablation, tyro.conf.subcommand("ablation")]
         | Annotated[study_grids.Inputs, tyro.conf.subcommand("inputs")]
+        | Annotated[study_grids.Resolution, tyro.conf.subcommand("resolution")]
+        | Annotated[study_grids.Randomisation, tyro.conf.subcommand("randomisation")]
+        | Annotated[study_grids.Rewards, tyro.conf.subcommand("rewards")]
+        | Annotated[study_grids.StartGoal, tyro.conf.subcommand("start-goal")]
+        | Annotated[study_grids.CurriculumStudy, tyro.conf.subcommand("curriculum")]
+        | Annotated[study_grids.ThesisRuns, tyro.conf.subcommand("thesis-runs")]
         | Annotated[FewDemonstrations, tyro.conf.subcommand("few-demonstrations")]
         | Annotated[Robustness, tyro.conf.subcommand("robustness")]
         | Annotated[Attention, tyro.conf.subcommand("attention")],

@@ -83,6 +83,107 @@ class Inputs(Grid):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class Resolution(Grid):
+    """Measure how small the picture of each camera may be, and whether it needs colour.
+
+    The thesis's study D.2, by imitation, on a level and on a tilted surface. Interrupted, the same
+    command goes on.
+
+    """
+
+    def plan(self) -> "Plan":
+        """Its cells."""
+        from hvs_suite.eval.studies import resolution
+
+        return resolution.plan(quick=self.quick)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Randomisation(Grid):
+    """Measure what training with disturbances costs without them, and gives with them.
+
+    The thesis's study D.3, by imitation, on align-hard: trained with nothing, with each and with
+    everything, and played with each. Interrupted, the same command goes on.
+
+    """
+
+    def plan(self) -> "Plan":
+        """Its cells."""
+        from hvs_suite.eval.studies import randomisation
+
+        return randomisation.plan(quick=self.quick)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Rewards(Grid):
+    """Measure which rewards help RL that begins with a few demonstrations.
+
+    The thesis's six sets (its study D.4), and the shapings that it wished for, on align-thesis.
+    Interrupted, the same command goes on.
+
+    """
+
+    def plan(self) -> "Plan":
+        """Its cells."""
+        from hvs_suite.eval.studies import rewards
+
+        return rewards.plan(quick=self.quick)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StartGoal(Grid):
+    """Measure what a fixed start or a fixed goal in training changes.
+
+    The thesis's study D.5, by imitation and by RL, on align-thesis; each policy plays all four
+    combinations. Interrupted, the same command goes on.
+
+    """
+
+    def plan(self) -> "Plan":
+        """Its cells."""
+        from hvs_suite.eval.studies import start_goal
+
+        return start_goal.plan(quick=self.quick)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CurriculumStudy(Grid):
+    """Measure what a curriculum buys RL that begins with a few demonstrations.
+
+    The thesis's study D.6, on align-thesis: none, one of tolerances, one of starts. Interrupted,
+    the same command goes on.
+
+    """
+
+    def plan(self) -> "Plan":
+        """Its cells."""
+        from hvs_suite.eval.studies import curriculum
+
+        return curriculum.plan(quick=self.quick)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ThesisRuns(Grid):
+    """Train the thesis's fourteen runs of SAC from scratch, at a budget that you name.
+
+    Recipes A to N have the values that the thesis had, on align-thesis. Interrupted, the same
+    command goes on.
+
+
+    Attributes:
+        steps: Environment steps of each run; the thesis had up to 500,000.
+    """
+
+    steps: int = 20_000
+
+    def plan(self) -> "Plan":
+        """Its cells."""
+        from hvs_suite.eval.studies import thesis_runs
+
+        return thesis_runs.plan(steps=self.steps, quick=self.quick)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Ablation(Grid):
     """Measure what each design choice of the hvs policy contributes, by training without it.
 
