@@ -54,7 +54,7 @@ def plan(*, steps: int = STEPS, quick: bool = False) -> Plan:
         random = min(many, 3 * steps // 4) if many else min(Settings.random_steps, steps // 2)
         settings = {**changed, "random_steps": random}
         if quick:
-            settings |= {"batch_size": 4, "replay_size": 100}
+            settings |= {"batch_size": 4}
         words = ", ".join(f"{name} {value:g}" for name, value in changed.items())
         cells.append(
             Cell(

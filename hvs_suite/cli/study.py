@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from hvs_suite.cli import console, study_files, study_grids
+from hvs_suite.cli import console, study_files, study_grids, study_search
 from hvs_suite.cli.players import Players, players
 from hvs_suite.errors import OptionError
 
@@ -269,6 +269,7 @@ class Study:
         | Annotated[study_grids.Rewards, tyro.conf.subcommand("rewards")]
         | Annotated[study_grids.StartGoal, tyro.conf.subcommand("start-goal")]
         | Annotated[study_grids.CurriculumStudy, tyro.conf.subcommand("curriculum")]
+        | Annotated[study_search.SearchStudy, tyro.conf.subcommand("search")]
         | Annotated[study_grids.ThesisRuns, tyro.conf.subcommand("thesis-runs")]
         | Annotated[FewDemonstrations, tyro.conf.subcommand("few-demonstrations")]
         | Annotated[Robustness, tyro.conf.subcommand("robustness")]
