@@ -9,7 +9,7 @@ from typing import Any
 
 from hvs_suite.eval.studies.grid import Cell, Plan
 from hvs_suite.eval.studies.training import Scenes
-from hvs_suite.eval.studies.ways import Imitation
+from hvs_suite.eval.studies.ways import TRIAL, Imitation
 from hvs_suite.policies.imitation.settings import INPUTS, Settings
 from hvs_suite.policies.training.dataset import read_manifest
 
@@ -19,7 +19,15 @@ LINEAR_SCALE = 0.5
 """A joint's step is seldom above this (rad), so errors weigh the same all over."""
 
 
-def plan(data: Path, *, steps: int, dagger_rounds: int, dagger_frames: int, episodes: int) -> Plan:
+def plan(
+    data: Path,
+    *,
+    steps: int,
+    dagger_rounds: int,
+    dagger_frames: int,
+    episodes: int,
+    quick: bool = False,
+) -> Plan:
     """The policy as it is, and without one thing at a time.
 
     Args:
@@ -28,6 +36,7 @@ def plan(data: Path, *, steps: int, dagger_rounds: int, dagger_frames: int, epis
         dagger_rounds: Rounds of DAgger, where not left out.
         dagger_frames: Frames a round.
         episodes: Scenarios that each policy is judged on.
+        quick: Make everything in minutes, of next to no training.
 
     Raises:
         DatasetError: The dataset cannot be read.
@@ -54,6 +63,9 @@ def plan(data: Path, *, steps: int, dagger_rounds: int, dagger_frames: int, epis
         **{name: {**alone, "episodes": n} for name, n in few.items()},
     }
     budget = {"dagger_rounds": dagger_rounds, "dagger_frames": dagger_frames}
+    if quick:
+        steps, episodes = TRIAL.steps, 2
+        budget = {"dagger_rounds": TRIAL.dagger_rounds, "dagger_frames": TRIAL.dagger_frames}
     cells = [
         Cell(
             group=manifest.task,

@@ -1,7 +1,8 @@
 """Thesis, D.4: which rewards help RL, from a policy that learned from few demonstrations.
 
 What RL adds of its own, a potential and the cost of a step, is switched off: policies learn from
-the reward that the cell names, and from nothing else.
+the reward that the cell names, and from nothing else. Fine-tuning keeps the base where it did not
+become better, so a reward that harms shows as one that does not help.
 
 Budget: on one core 16,000 environment steps took 10 to 14 minutes
 (docs/experiments/first-design.md), evaluations 3 more. Nine cells that learn, with three seeds, and

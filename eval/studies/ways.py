@@ -125,6 +125,8 @@ class Imitation:
 class Finetuning:
     """RL on top of an imitated policy of the same seed.
 
+    Of start and end it keeps what was evaluated better, so harm shows as no help.
+
     Attributes:
         base: That policy.
         task: Named task.

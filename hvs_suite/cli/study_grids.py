@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from hvs_suite.cli import console, study_files
 from hvs_suite.cli.players import players
+from hvs_suite.errors import OptionError
 
 if TYPE_CHECKING:
     from hvs_suite.eval.studies.grid import Plan, Study
@@ -180,6 +181,8 @@ class ThesisRuns(Grid):
         """Its cells."""
         from hvs_suite.eval.studies import thesis_runs
 
+        if self.seeds is not None:
+            raise OptionError("the runs have the thesis's seeds; leave --seeds out")
         return thesis_runs.plan(steps=self.steps, quick=self.quick)
 
 
@@ -214,4 +217,5 @@ class Ablation(Grid):
             dagger_rounds=self.dagger_rounds,
             dagger_frames=self.dagger_frames,
             episodes=self.episodes,
+            quick=self.quick,
         )
