@@ -65,8 +65,9 @@ def _cells(row: Row, several: bool) -> list[str]:
 
 def _words(rows: Sequence[Row]) -> list[str]:
     """What the table says, one sentence for each thing that is compared."""
-    best = max(rows, key=lambda row: row.rate)
-    lines = [f"- Most scenes are solved by {_name(best, rows)}: {best.rate:.1f} %."]
+    most = max(row.rate for row in rows)
+    best = "; ".join(_name(row, rows) for row in rows if row.rate == most)
+    lines = [f"- Most scenes are solved by {best}: {most:.1f} %." if most else "- None is solved."]
     tested = [row for row in rows if row.p is not None]
     for against in dict.fromkeys(row.cell[0].against for row in tested):
         own = [row for row in tested if row.cell[0].against == against]
