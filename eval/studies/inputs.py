@@ -1,5 +1,9 @@
 """Thesis, D.1: which inputs a policy needs, of two cameras, joint positions and joint velocities.
 
+Actions are joint positions, so a policy that is given none still knows what it has sent. It reckons
+the joints from there and from where the arm starts: in two episodes of the expert on each task to
+1.4 mrad, which is a millimetre at the tip.
+
 Budget: on one core 4,000 optimiser steps on ``align-thesis`` took 9 minutes and 5,000 on
 ``track-line`` 18 (metadata of the shipped weights' results); rounds of DAgger, decoding and 200
 scenes come to 4 minutes more. So a cell takes 11 and 18 minutes, and the 24 cells with two seeds

@@ -33,8 +33,9 @@ IMITATION = Effort(demonstrations=400, steps=1000)
 STUDY_NAME = "hvs"
 JOURNAL = "search.journal"
 TRIALS = {"imitation": 80, "rl": 40}
-FEWEST = 4
-"""Trials without which nothing is said of what mattered."""
+QUICK_TRIALS = 4
+FEWEST = 10
+"""Trials without which nothing is said of what mattered: the best tenth is one of them."""
 
 type Learner = Literal["imitation", "rl"]
 
@@ -103,7 +104,7 @@ class Search(pydantic.BaseModel):
         trials: In the order of the proposals.
         importances: Share that each setting had in what sets the best tenth of trials apart from
             the others, in sum 1, by PED-ANOVA (Watanabe, Bansal and Hutter, 2023:
-            https://arxiv.org/abs/2304.10255); empty where there are too few trials to say.
+            https://arxiv.org/abs/2304.10255); empty where the trials are too few to say, or alike.
     """
 
     task: str
@@ -165,7 +166,7 @@ def run_search(
                 )
                 for each in done
             ],
-            importances=_importances(study) if len(done) >= FEWEST else {},
+            importances=_importances(study),
         )
 
     while True:
@@ -255,6 +256,9 @@ def _cell(learner: Learner, number: int, settings: Mapping[str, Any], quick: boo
 def _importances(study: "optuna.Study") -> dict[str, float]:
     import optuna
 
+    values = [each.value for each in study.trials if each.value is not None]
+    if len(values) < FEWEST or len(set(values)) == 1:
+        return {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         evaluator = optuna.importance.PedAnovaImportanceEvaluator()

@@ -25,7 +25,9 @@ def markdown(search: Search) -> str:
         *(_line(each, names) for each in ranked[:SHOWN]),
         "",
         f"- The best is trial {best.number}: {_rate(best):.1f} % ({low:.1f} to {high:.1f} %). As "
-        "the best of many it owes something to chance; score it on other scenes.",
+        "the best of many it owes something to chance; score it on other scenes."
+        if best.n_success
+        else "- None is solved.",
     ]
     if search.importances:
         lines += [
@@ -54,8 +56,10 @@ def draw(search: Search) -> Any:
     """What each trial reached, and how much each setting mattered; a ``matplotlib`` figure."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9.0, 3.4), dpi=130, layout="constrained")
-    history, importance = figure.subplots(1, 2)
+    shares = search.importances
+    figure = Figure(figsize=(9.0 if shares else 4.6, 3.4), dpi=130, layout="constrained")
+    panels = figure.subplots(1, 2 if shares else 1, squeeze=False)[0]
+    history = panels[0]
     rates = [_rate(each) for each in search.trials]
     numbers = [each.number for each in search.trials]
     history.plot(numbers, rates, "o", color="#2b6cb0", markersize=4, label="a trial")
@@ -63,10 +67,10 @@ def draw(search: Search) -> Any:
     history.step(numbers, so_far, where="post", color="#e9620a", label="the best so far")
     history.set(xlabel="trial", ylabel="solved (%)", ylim=(-2.0, 102.0))
     history.legend(fontsize=8, frameon=False)
-    shares = search.importances
-    importance.barh(list(shares)[::-1], list(shares.values())[::-1], color="#2b6cb0")
-    importance.set_xlabel("importance (PED-ANOVA)")
-    for axes in (history, importance):
+    if shares:
+        panels[1].barh(list(shares)[::-1], list(shares.values())[::-1], color="#2b6cb0")
+        panels[1].set_xlabel("importance (PED-ANOVA)")
+    for axes in panels:
         axes.spines[["top", "right"]].set_visible(False)
         axes.tick_params(labelsize=8)
     figure.suptitle(f"{search.task}, {search.learner}", fontsize=10, x=0.01, ha="left")

@@ -46,7 +46,7 @@ class SearchStudy:
         check_writable(self.out / "study.json")
         trials = self.trials
         if trials is None:
-            trials = search.FEWEST if self.quick else search.TRIALS[self.learner]
+            trials = search.QUICK_TRIALS if self.quick else search.TRIALS[self.learner]
 
         def write(found: "search.Search") -> str:
             text = search_report.markdown(found)

@@ -172,6 +172,23 @@ def test_cells_that_play_several_scenes_make_a_map():
     assert [text.get_text() for text in axes.texts] == ["100", "50", "0", "100"]
 
 
+def test_a_study_that_is_finished_is_reported_at_once(tmp_path, capsys):
+    plan = inputs.plan(quick=True)
+    maker = Maker(tmp_path, tmp_path, plan.episodes)
+    (tmp_path / "cells").mkdir()
+    for cell in plan.chosen([inputs.WHOLE]):
+        done = finished(cell.name, "10", against=None).model_copy(update={"group": cell.group})
+        maker.path(cell, 0).write_text(done.model_dump_json())
+    words = ["study", "inputs", "--quick", "--out", str(tmp_path), "--cell", inputs.WHOLE]
+    assert run(words) == 0
+    text = (tmp_path / "study.md").read_text()
+    assert text in capsys.readouterr().out
+    assert "## track-line" in text
+    study = Study.model_validate_json((tmp_path / "study.json").read_bytes())
+    assert len(study.finished) == 2
+    assert (tmp_path / "study.png").stat().st_size > 10_000
+
+
 def test_nonsense_is_refused(tmp_path, capsys):
     words = ["study", "inputs", "--quick", "--out", str(tmp_path), "--cell", "no thanks"]
     assert run(words) == 2
