@@ -14,15 +14,15 @@ from isal import isal_zlib
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _BITS = 8
-_RGB = 2
+_COLOUR_TYPES = {3: 2, 1: 0}
 _FILTER_UP = 2
 _LEVEL = 1
 
 
 def encode(pictures: Sequence[npt.NDArray[np.uint8]]) -> list[bytes]:
-    """Pictures, RGB uint8 (H, W, 3) and all alike in shape, as PNG files."""
+    """Pictures, uint8 (H, W, C) and all alike in shape, as PNG files; C 3 for RGB, 1 for grey."""
     height, width, channels = pictures[0].shape
-    header = struct.pack(">IIBBBBB", width, height, _BITS, _RGB, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", width, height, _BITS, _COLOUR_TYPES[channels], 0, 0, 0)
     head, tail = _SIGNATURE + _chunk(b"IHDR", header), _chunk(b"IEND", b"")
     # One buffer for all: touching fresh memory takes longer than filtering into it.
     lines = np.full((height, 1 + width * channels), _FILTER_UP, np.uint8)

@@ -35,7 +35,7 @@ from hvs_suite.eval.studies.compression_figures import (
     Success,
     located,
 )
-from hvs_suite.eval.studies.training import Note, Report, train_and_judge
+from hvs_suite.eval.studies.training import Note, Report, Scenes, train_and_judge
 from hvs_suite.executor import Workers, check_workers
 from hvs_suite.files import check_writable, replacing
 from hvs_suite.policies.imitation.frame_cache import fingerprint
@@ -338,12 +338,12 @@ def _trained(
             on_progress=note,
         )
 
-    result = train_and_judge(
+    [result] = train_and_judge(
         _words(encoding),
-        original.task,
         run,
         train,
         report,
+        on=[Scenes(task=original.task)],
         scenarios=training.episodes,
         workers=training.workers,
     )

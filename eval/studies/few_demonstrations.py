@@ -18,7 +18,7 @@ import pydantic
 from hvs_suite.errors import OptionError, OutputError
 from hvs_suite.eval.scoring.comparison import Tally
 from hvs_suite.eval.scoring.result_file import Result
-from hvs_suite.eval.studies.training import Note, Report, train_and_judge
+from hvs_suite.eval.studies.training import Note, Report, Scenes, minutes, train_and_judge
 from hvs_suite.executor import Workers, check_workers, spread
 from hvs_suite.files import replacing
 from hvs_suite.policies.training.dataset import read_manifest
@@ -311,9 +311,9 @@ def _make_family(maker: "_Maker", count: int, seed: int) -> Family:
         }
     else:
         runs = {SCRATCH: maker.scratch(seed)}
-    for way, (points, end, minutes) in runs.items():
+    for way, (points, end, taken_min) in runs.items():
         whole = [*first, *points, _point(maker.budget.env_steps, end)]
-        family.curves[way] = Curve(points=whole, minutes=minutes)
+        family.curves[way] = Curve(points=whole, minutes=taken_min)
         family.ends[way] = _end(end)
     return family
 
@@ -364,8 +364,8 @@ class _Maker:
                 on_progress=note,
             )
 
-        training, end = self._made("finetuned", count, seed, train)
-        return _evaluated(training), end, _minutes(training)
+        run, end = self._made("finetuned", count, seed, train)
+        return _evaluated(run), end, minutes(run)
 
     def imitated(self, count: int, seed: int) -> tuple[list[Point], Result, float]:
         """Let the expert label every step instead."""
@@ -387,14 +387,14 @@ class _Maker:
                 on_progress=note,
             )
 
-        training, end = self._made("imitated", count, seed, train)
-        rounds = json.loads((training / "outcome.json").read_text())["rounds"]
+        run, end = self._made("imitated", count, seed, train)
+        rounds = json.loads((run / "policy/training/outcome.json").read_text())["rounds"]
         points = [
             Point(env_steps=i * frames, n=each["episodes"], n_success=each["successes"])
             for i, each in enumerate(rounds)
         ]
         # What the first round plays has learned more than its base, and has no steps yet.
-        return points[1:], end, _minutes(training)
+        return points[1:], end, minutes(run)
 
     def scratch(self, seed: int) -> tuple[list[Point], Result, float]:
         """Learn by RL alone, as the thesis did."""
@@ -411,8 +411,8 @@ class _Maker:
                 on_progress=note,
             )
 
-        training, end = self._made("scratch", 0, seed, train)
-        return _evaluated(training), end, _minutes(training)
+        run, end = self._made("scratch", 0, seed, train)
+        return _evaluated(run), end, minutes(run)
 
     def _folder(self, way: str, count: int, seed: int) -> Path:
         return self.out / f"seed-{seed}" / (f"{way}-{count}" if count else way)
@@ -420,25 +420,24 @@ class _Maker:
     def _made(
         self, way: str, count: int, seed: int, train: Callable[[Path, Note], None]
     ) -> tuple[Path, Result]:
-        """Train and judge a run unless that is done; the folder of its training, and its result."""
+        """Train and judge a run unless that is done; its folder and its result."""
         run, budget = self._folder(way, count, seed), self.budget
-        training = run / "policy" / "training"
         name = f"{way}, {count} demonstrations, seed {seed}" if count else f"{way}, seed {seed}"
-        result = train_and_judge(
-            name, self.task, run, train, self.report, scenarios=budget.episodes, workers=1
+        [result] = train_and_judge(
+            name,
+            run,
+            train,
+            self.report,
+            on=[Scenes(task=self.task)],
+            scenarios=budget.episodes,
+            workers=1,
         )
-        return training, result
+        return run, result
 
 
-def _minutes(training: Path) -> float:
-    """What a training took."""
-    outcome = json.loads((training / "outcome.json").read_text(encoding="utf-8"))
-    return float(outcome["train_s"] + outcome.get("play_s", 0.0)) / 60.0
-
-
-def _evaluated(training: Path) -> list[Point]:
+def _evaluated(run: Path) -> list[Point]:
     """Success of an RL run during its training, without its end."""
-    rows = json.loads((training / "evaluations.json").read_text())[:-1]
+    rows = json.loads((run / "policy/training/evaluations.json").read_text())[:-1]
     return [
         Point(
             env_steps=row["env_steps"],

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 from pathlib import Path
+from typing import Literal
 
 from hvs_suite.cli.rl_session import show_run
 from hvs_suite.policies.residual.settings import Settings
@@ -42,6 +43,9 @@ class Finetune:
         environments: How many play; they share the scenes between them.
         eval_every: Environment steps between evaluations; one more comes at start and end.
         eval_episodes: Episodes an evaluation, on scenes of a split of their own.
+        curriculum: Learn on easier levels first: tolerance shrinks the tolerances from eightfold,
+            start begins near the goal. The next level comes when four fifths of the last fifty
+            episodes succeed.
         option: Parameter of the task to change for a study, such as target_diameter_m=0.03; give it
             several times for several.
     """
@@ -67,6 +71,7 @@ class Finetune:
     environments: int = Settings.environments
     eval_every: int = 10_000
     eval_episodes: int = 100
+    curriculum: Literal["tolerance", "start"] | None = None
     option: tuple[str, ...] = ()
 
     def run(self) -> None:
@@ -89,6 +94,7 @@ class Finetune:
             seed=self.seed,
             settings=settings,
             options=options,
+            curriculum=self.curriculum,
             eval_every=self.eval_every,
             eval_episodes=self.eval_episodes,
         )

@@ -31,7 +31,10 @@ class Pretrain(Players):
         dagger_rounds: DAgger rounds, spread over the training: the policy plays, the expert labels
             every step, and the frames are added. Their time comes on top of --minutes.
         dagger_frames: Frames a round.
-        inputs: Cameras that the policy is given, eih or eth; both by default (eih+eth).
+        inputs: What the policy is given: eih, eth, joint_positions and joint_velocities, some of
+            them joined by +; all by default. Without joint_positions it knows where the arm starts
+            and what it has sent.
+        grey: Cameras whose pictures it is given in grey, joined by +.
         episodes: Number of demonstrations to learn from, the first ones of the dataset; all by
             default.
         error_scale: Errors of a joint's step (rad) and of a place (m) weigh linearly below this
@@ -40,6 +43,8 @@ class Pretrain(Players):
             find: a checkpoint folder, or a named task for the weights shipped for it.
         windows: Windows of control steps that belief and head learn from in a step.
         window_steps: Length of each.
+        batch_size: Frames that the eyes learn from in a step.
+        learning_rate: Peak of the schedule.
         seed: Seed of the initial weights, the held-out episodes and the order.
     """
 
@@ -50,11 +55,14 @@ class Pretrain(Players):
     dagger_rounds: int = 0
     dagger_frames: int = 6000
     inputs: str | None = None
+    grey: str | None = None
     episodes: int | None = None
     error_scale: float | None = None
     eyes: str | None = None
     windows: int = 48
     window_steps: int = 16
+    batch_size: int = 64
+    learning_rate: float = 2e-3
     seed: int = 0
 
     def run(self) -> None:
@@ -73,11 +81,14 @@ class Pretrain(Players):
                 dagger_rounds=self.dagger_rounds,
                 dagger_frames=self.dagger_frames,
                 inputs=None if self.inputs is None else tuple(self.inputs.split("+")),
+                grey=() if self.grey is None else tuple(self.grey.split("+")),
                 episodes=self.episodes,
                 error_scale=self.error_scale,
                 eyes=None if self.eyes is None else _folder(self.eyes),
                 windows=self.windows,
                 window_steps=self.window_steps,
+                batch_size=self.batch_size,
+                learning_rate=self.learning_rate,
                 workers=self.players(local=2),
                 seed=self.seed,
                 on_progress=lambda state: update(state.stage, state.share, _words(state)),

@@ -2,11 +2,11 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
-from hvs_suite.cli import console
+from hvs_suite.cli import console, study_files, study_grids, study_search
 from hvs_suite.cli.players import Players, players
 from hvs_suite.errors import OptionError
 
@@ -57,10 +57,10 @@ class Compression(Players):
         data = self._recorded() if self.data is None else self.data
         with console.meter() as update:
             study = compression.run_study(data, self.out, encodings, training, update)
-        _write_json(self.out, study)
+        study_files.write_json(self.out, study)
         text = compression_report.markdown(study)
-        _write_report(self.out, text, compression_report.draw(study))
-        _say(self.out, text)
+        study_files.write_report(self.out, text, compression_report.draw(study))
+        study_files.say(self.out, text)
 
     def _recorded(self) -> Path:
         """The study's own recording, gone on with where it was interrupted."""
@@ -78,57 +78,6 @@ class Compression(Players):
             resume=True,
         ).run()
         return data
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Ablation(Players):
-    """Measure what each design choice of the hvs policy contributes, by training without it.
-
-    Every policy learns from the same data with the same seed and steps, and is judged on the same
-    scenarios of split dev. Interrupted, the same command goes on.
-
-    Attributes:
-        data: Recorded dataset; its task is played.
-        out: Folder of the study: study.json, study.md, study.png, and a sub-folder a policy.
-        row: What to leave out, such as "no eye in hand"; give it several times; everything that
-            can be left out by default.
-        steps: Optimiser steps of each policy.
-        dagger_rounds: DAgger rounds, where they are not what is left out.
-        dagger_frames: Frames a round.
-        episodes: Scenarios that each policy is judged on.
-        seed: Of every policy's weights and order.
-    """
-
-    data: Path
-    out: Path
-    row: tuple[str, ...] = ()
-    steps: int = 4000
-    dagger_rounds: int = 3
-    dagger_frames: int = 6000
-    episodes: int = 200
-    seed: int = 0
-
-    def run(self) -> None:
-        """Train and judge, showing how it goes; write and print what was found."""
-        from hvs_suite.eval.studies import ablation
-        from hvs_suite.files import check_writable
-
-        check_writable(self.out / "study.json")
-        budget = ablation.Budget(
-            steps=self.steps,
-            dagger_rounds=self.dagger_rounds,
-            dagger_frames=self.dagger_frames,
-            seed=self.seed,
-            episodes=self.episodes,
-            workers=self.players(local=2),
-        )
-        rows = self.row or tuple(ablation.ABLATIONS)
-        with console.meter() as update:
-            study = ablation.run_study(self.data, self.out, rows, budget, update)
-        _write_json(self.out, study)
-        text = ablation.markdown(study)
-        _write_report(self.out, text, ablation.draw(study))
-        _say(self.out, text)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -188,7 +137,7 @@ class FewDemonstrations:
             text = few_demonstrations_report.markdown(study)
             # RL from scratch has no place of its own: it is a control of each base.
             if study.counts():
-                _write_report(self.out, text, few_demonstrations_report.draw(study))
+                study_files.write_report(self.out, text, few_demonstrations_report.draw(study))
             return text
 
         with console.meter() as update:
@@ -202,7 +151,7 @@ class FewDemonstrations:
                 workers=players(self.processes, self.ray, local=2),
                 on_finished=write,
             )
-        _say(self.out, write(study))
+        study_files.say(self.out, write(study))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -252,10 +201,10 @@ class Robustness(Players):
         )
         with console.meter() as update:
             study = robustness.run_study(
-                plan, self.out, update, lambda found: _write_json(self.out, found)
+                plan, self.out, update, lambda found: study_files.write_json(self.out, found)
             )
         text = robustness_report.markdown(study)
-        _write_report(self.out, text, robustness_report.draw([study, *others]))
+        study_files.write_report(self.out, text, robustness_report.draw([study, *others]))
         console.print_table(
             robustness_report.COLUMNS,
             robustness_report.rows(study),
@@ -303,30 +252,6 @@ class Attention:
         print(f"wrote {self.out}")
 
 
-def _write_json(out: Path, study: Any) -> None:
-    """Write all that a study found, a pydantic model."""
-    from hvs_suite.files import replacing
-
-    with replacing(out / "study.json") as temporary:
-        temporary.write_text(study.model_dump_json(indent=2) + "\n", encoding="utf-8")
-
-
-def _write_report(out: Path, text: str, figure: Any) -> None:
-    """Write a study's tables and picture."""
-    from hvs_suite.files import replacing
-
-    with replacing(out / "study.md") as temporary:
-        temporary.write_text(text, encoding="utf-8")
-    with replacing(out / "study.png") as temporary:
-        figure.savefig(temporary)
-
-
-def _say(out: Path, text: str) -> None:
-    """Print a study's tables, and where it is written."""
-    print(text, end="")
-    print(f"wrote {out / 'study.json'}, study.md and study.png")
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Study:
     """Run an experiment about the suite itself.
@@ -337,7 +262,15 @@ class Study:
 
     study: Annotated[
         Annotated[Compression, tyro.conf.subcommand("compression")]
-        | Annotated[Ablation, tyro.conf.subcommand("ablation")]
+        | Annotated[study_grids.Ablation, tyro.conf.subcommand("ablation")]
+        | Annotated[study_grids.Inputs, tyro.conf.subcommand("inputs")]
+        | Annotated[study_grids.Resolution, tyro.conf.subcommand("resolution")]
+        | Annotated[study_grids.Randomisation, tyro.conf.subcommand("randomisation")]
+        | Annotated[study_grids.Rewards, tyro.conf.subcommand("rewards")]
+        | Annotated[study_grids.StartGoal, tyro.conf.subcommand("start-goal")]
+        | Annotated[study_grids.CurriculumStudy, tyro.conf.subcommand("curriculum")]
+        | Annotated[study_search.SearchStudy, tyro.conf.subcommand("search")]
+        | Annotated[study_grids.ThesisRuns, tyro.conf.subcommand("thesis-runs")]
         | Annotated[FewDemonstrations, tyro.conf.subcommand("few-demonstrations")]
         | Annotated[Robustness, tyro.conf.subcommand("robustness")]
         | Annotated[Attention, tyro.conf.subcommand("attention")],

@@ -97,6 +97,9 @@ class Shape:
             (m).
         residual_reach_m: How far from the believed goal the tip may be for the goal to be moved
             (m).
+        reads_positions: Whether measured joint positions are read; without them the network knows
+            where the arm starts, and from there on where it has sent it.
+        reads_velocities: Whether measured joint velocities are read; without them they count as 0.
     """
 
     cameras: Mapping[str, tuple[int, int]]
@@ -108,6 +111,8 @@ class Shape:
     residual_hidden: int = 0
     residual_step_m: tuple[float, float] = (0.0004, 0.001)
     residual_reach_m: float = 0.02
+    reads_positions: bool = True
+    reads_velocities: bool = True
 
 
 MEMORY_SIZE = BELIEF_SIZE + 2 * N_JOINTS + 1 + RECENT_SIZE
@@ -285,7 +290,8 @@ class BeliefNetwork(nn.Module):
         Returns:
             (B, k).
         """
-        if views is None:
+        q = self._joints(memory, q)
+        if views is None or not self.shape.reads_positions:
             views = self.views(geometry.flange_motion(q.double()))
         believed, forget = self.belief(memory[:, :BELIEF_SIZE], sightings, views)
         begun = memory[:, BEGUN] > 0
@@ -324,6 +330,7 @@ class BeliefNetwork(nn.Module):
             (B, k), and what the residual reads, (B, n).
         """
         assert self.residual is not None
+        state = self._read(memory, state)
         place = self._place(memory, state[:, :N_JOINTS])
         read = self._head_inputs(memory, sightings, state, felt, place)
         part = self.residual.remember(
@@ -392,6 +399,7 @@ class BeliefNetwork(nn.Module):
             felt: Wrench at the tip, (B, 6); None without.
         """
         scale = self.shape.error_scale
+        state = self._read(memory, state)
         place = self._place(memory, state[:, :N_JOINTS])
         here, sent, goal, normal = place.here, place.sent, place.goal, place.normal
         set_point = memory[:, SET_POINT].float()
@@ -442,6 +450,19 @@ class BeliefNetwork(nn.Module):
         mean = (weights.softmax(dim=1)[:, :, None] * torch.stack(proposals, dim=1)).sum(dim=1)
         total = torch.asinh(mean / scale) + torch.sigmoid(is_corrected) * correction
         return Decision(total, torch.stack(said, dim=1), weights)
+
+    def _joints(self, memory: Tensor, q: Tensor) -> Tensor:
+        """Joint positions as the network knows them, (B, 7) rad: measured, or reckoned."""
+        if self.shape.reads_positions:
+            return q
+        return torch.where(memory[:, BEGUN] > 0, memory[:, TRAILING].to(q.dtype), q)
+
+    def _read(self, memory: Tensor, state: Tensor) -> Tensor:
+        """The state (B, 14) without what the network does not read of it."""
+        q, velocity = state[:, :N_JOINTS], state[:, N_JOINTS:]
+        if not self.shape.reads_velocities:
+            velocity = torch.zeros_like(velocity)
+        return torch.cat([self._joints(memory, q), velocity], dim=1)
 
     def _moving(self, memory: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Joints (B, 7) rad and their velocities (rad/s) when the next action takes effect."""

@@ -87,6 +87,8 @@ class Settings(pydantic.BaseModel):
         residual_hidden: See `Shape`.
         residual_step_m: See `Shape`.
         residual_reach_m: See `Shape`.
+        reads_positions: See `Shape`.
+        reads_velocities: See `Shape`.
     """
 
     model_config = pydantic.ConfigDict(extra="ignore")
@@ -104,6 +106,8 @@ class Settings(pydantic.BaseModel):
     residual_reach_m: Annotated[float, pydantic.Field(strict=True, gt=0.0, le=10.0)] = (
         Shape.residual_reach_m
     )
+    reads_positions: Annotated[bool, pydantic.Field(strict=True)] = True
+    reads_velocities: Annotated[bool, pydantic.Field(strict=True)] = True
 
     @pydantic.model_validator(mode="after")
     def _fit(self) -> "Settings":
@@ -154,6 +158,8 @@ class Settings(pydantic.BaseModel):
             residual_hidden=self.residual_hidden,
             residual_step_m=self.residual_step_m,
             residual_reach_m=self.residual_reach_m,
+            reads_positions=self.reads_positions,
+            reads_velocities=self.reads_velocities,
         )
 
     def network(self) -> BeliefNetwork:

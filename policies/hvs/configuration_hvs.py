@@ -38,6 +38,8 @@ class HvsConfig(PreTrainedConfig):
         residual_step_m: The most that it moves the goal in a step: sideways, and along the normal
             (m).
         residual_reach_m: How far from the believed goal it does (m).
+        reads_positions: Whether it reads measured joint positions, see `Shape`.
+        reads_velocities: Whether it reads measured joint velocities.
         family: Family of the tasks that it was trained for.
         control_period_s: Length of their control step (s).
         options: Options of the task that it was trained with, where they differ from the named one;
@@ -64,6 +66,8 @@ class HvsConfig(PreTrainedConfig):
     residual_hidden: int = 0
     residual_step_m: tuple[float, float] = Shape.residual_step_m
     residual_reach_m: float = Shape.residual_reach_m
+    reads_positions: bool = True
+    reads_velocities: bool = True
     family: str = FAMILY
     control_period_s: float = CONTROL_PERIOD_S
     options: dict[str, Any] = field(default_factory=dict)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from hvs_suite.cell.cameras import to_grey
 from hvs_suite.datasets import reader
 from hvs_suite.errors import DatasetError, OutputError, first_line
 from hvs_suite.files import replacing
@@ -48,7 +49,7 @@ def cached_frames(
     Args:
         root: The dataset.
         key: Feature of dtype ``image``, e.g. ``observation.images.eih``.
-        shape: (H, W, C) of its frames.
+        shape: (H, W, C) of its frames; C 1 turns colour into grey.
         n_frames: Frames in the dataset.
         folder: Where the cache lives; made if missing.
         on_frames: Called with the number of frames just decoded.
@@ -80,7 +81,8 @@ def cached_frames(
         if done >= n_frames:
             raise DatasetError(f"{root} holds more than the {n_frames} frames that it declares")
         try:
-            frames[done] = reader.decode(stored, shape)
+            picture = reader.decode(stored, (*shape[:2], 3))
+            frames[done] = picture if shape[2] == 3 else to_grey(picture)
         except DatasetError as error:
             raise DatasetError(f"{root}: frame {done}: {key} {error}; see 'hvs check'") from None
         done += 1

@@ -138,8 +138,8 @@ def pretrain(
     manifest = read_manifest(data)
     refuse_test_split(manifest)
     chosen = settings_for(manifest, eyes, settings)
-    if chosen.inputs is not None:
-        manifest = manifest.with_inputs(chosen.inputs)
+    cameras = [name for name in manifest.cameras if chosen.reads(name)]
+    manifest = manifest.with_cameras(cameras, chosen.grey)
     prepare_process()
     identity = dataclasses.asdict(chosen)
     with claimed(out, identity):

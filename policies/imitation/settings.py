@@ -20,6 +20,9 @@ from hvs_suite.policies.imitation.frame_cache import fingerprint
 from hvs_suite.policies.trained_for import trained_for
 from hvs_suite.policies.training.dataset import Manifest
 from hvs_suite.registry import find
+from hvs_suite.tasks.shared.spec import PRESETS
+
+INPUTS = PRESETS["vision"]
 
 if TYPE_CHECKING:
     from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
@@ -38,7 +41,8 @@ class Settings:
         dagger_frames: Frames a round.
         dataset: Fingerprint of the dataset.
         task: Named task that it was recorded on.
-        inputs: Cameras that the policy is given, of ``eih`` and ``eth``; None for all.
+        inputs: What the policy is given of `INPUTS`, one camera or more; None for all.
+        grey: Cameras whose pictures it is given in grey; the dataset's are in colour.
         episodes: Learn from the first so many demonstrations alone; None from all.
         error_scale: See `HvsConfig`.
         eyes: SHA-256 of the weights whose eyes it begins with; None for fresh ones.
@@ -54,11 +58,16 @@ class Settings:
     dataset: str
     task: str
     inputs: tuple[str, ...] | None = None
+    grey: tuple[str, ...] = ()
     episodes: int | None = None
     error_scale: float
     eyes: str | None = None
     windows: int = 48
     window_steps: int = 16
+
+    def reads(self, name: str) -> bool:
+        """Whether the policy is given an input."""
+        return self.inputs is None or name in self.inputs
 
     def check(self, manifest: Manifest) -> None:
         """Refuse numbers that make no sense.
@@ -69,6 +78,8 @@ class Settings:
         Raises:
             OptionError: There is one.
         """
+        if unknown := sorted({*(self.inputs or ())} - {*INPUTS}):
+            raise OptionError(f"unknown input {unknown[0]!r}; choose from {', '.join(INPUTS)}")
         for name in ("batch_size", "dagger_frames", "windows", "window_steps"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}")
@@ -140,6 +151,8 @@ def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":
         error_scale=settings.error_scale,
         cell=as_numbers(cell_model(task)),
         window=settings.window_steps,
+        reads_positions=settings.reads("joint_positions"),
+        reads_velocities=settings.reads("joint_velocities"),
         **trained_for(task).model_dump(),
     )
     # torch initialises weights from its global generator; leave that as it was found.

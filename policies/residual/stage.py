@@ -12,7 +12,7 @@ not.
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -29,8 +29,12 @@ from hvs_suite.policies.checkpoints.files import read_config
 from hvs_suite.policies.checkpoints.loading import network_inputs
 from hvs_suite.policies.residual.folding import load_base, with_residual
 from hvs_suite.policies.residual.settings import Settings
+from hvs_suite.policies.rl.curriculum import Kind, Ladder, Level, levels_of
 from hvs_suite.registry import find, load
 from hvs_suite.rollout import one_torch_thread
+
+if TYPE_CHECKING:
+    from hvs_suite.tasks.shared.environment import Environment
 
 READ = "read"
 """Key of what the actor reads."""
@@ -54,11 +58,15 @@ class Place:
         episode: Number of the episode.
         actions: Since it began, (3,) each.
         played: Control steps of all episodes.
+        level: Of the curriculum.
+        recent: How the last episodes ended on that level.
     """
 
     episode: int = 0
     actions: Sequence[Sequence[float]] = ()
     played: int = 0
+    level: int = 0
+    recent: Sequence[bool] = ()
 
 
 class Stage(gymnasium.Env[Any, Any]):
@@ -85,15 +93,20 @@ class Stage(gymnasium.Env[Any, Any]):
         self._make = make
         folder = Path(make.folder)
         self._config = read_config(folder)
-        self._env = load(make.task, split=make.split, **make.options)
+        self._levels: Sequence[Level] = [{}]
+        if make.curriculum is not None:
+            self._levels = levels_of(make.task, make.curriculum, make.options)
+        self._ladder = Ladder(len(self._levels))
+        self._ladder.load_state_dict(dataclasses.asdict(make.place))
+        self._env = self._load()
         with one_torch_thread():
             settings = make.settings
             self._network = with_residual(load_base(folder), settings)
             self._parts = CompiledParts(self._network)
         assert self._network.residual is not None
-        spec = self._env.spec
+        # Those of the task itself: what the critics read means the same on every level.
         self._bounds = make.bounds
-        self._step_bounds = spec.step_bounds
+        self._step_bounds = find(make.task).with_options(make.options).step_bounds
         self._place = make.place
         self._episode, self._played = make.place.episode, make.place.played
         self._potential = self._return = 0.0
@@ -151,7 +164,12 @@ class Stage(gymnasium.Env[Any, Any]):
         self._env.close()
 
     def _counts(self) -> dict[str, Any]:
-        return {"episode": self._episode, "played": self._played}
+        return {"episode": self._episode, "played": self._played, **self._ladder.state_dict()}
+
+    def _load(self) -> "Environment":
+        """The task on the level that is due."""
+        make, level = self._make, self._levels[self._ladder.level]
+        return load(make.task, split=make.split, **{**make.options, **level})
 
     def _fly(self) -> None:
         """Play scenes until an action has an effect; mostly that is in the first of them.
@@ -161,6 +179,9 @@ class Stage(gymnasium.Env[Any, Any]):
         """
         make = self._make
         for _ in range(MOST_FLIGHTS):
+            if self._ladder.climb():
+                self._env.close()
+                self._env = self._load()
             scenario = make.seed * SCENES_A_SEED + make.part
             scenario += make.settings.environments * self._episode
             self._memory = self._network.start(1)
@@ -190,7 +211,9 @@ class Stage(gymnasium.Env[Any, Any]):
         self._length += 1
         self._played += 1
         self._look(time_step.observation)
-        return bool(time_step.last())
+        if over := bool(time_step.last()):
+            self._ladder.note(bool(self._env.info["is_success"]))
+        return over
 
     def _look(self, observation: Mapping[str, npt.NDArray[Any]]) -> None:
         self._inputs = inputs = network_inputs(self._network, self._config, observation)
@@ -239,6 +262,7 @@ class MakeStage:
         seed: Of the run.
         part: Which of the players it is; they share the scenes between them.
         place: Where to begin.
+        curriculum: See `hvs_suite.policies.rl.curriculum.levels_of`; None for the task alone.
     """
 
     task: str
@@ -249,6 +273,7 @@ class MakeStage:
     seed: int
     part: int = 0
     place: Place = Place()
+    curriculum: Kind | None = None
 
     @property
     def bounds(self) -> dict[str, float]:

@@ -36,6 +36,7 @@ from hvs_suite.policies.residual.replay import Replay
 from hvs_suite.policies.residual.settings import Settings
 from hvs_suite.policies.residual.stage import PRIVILEGED, READ, MakeStage, Place
 from hvs_suite.policies.residual.state import load_state, save_state
+from hvs_suite.policies.rl.curriculum import Kind
 from hvs_suite.policies.rl.evaluation import (
     Evaluator,
     fallen,
@@ -69,6 +70,7 @@ def finetune(
     seed: int = 0,
     settings: Settings | None = None,
     options: Mapping[str, Any] | None = None,
+    curriculum: Kind | None = None,
     split: str = "train",
     eval_every: int = 10_000,
     eval_episodes: int = 100,
@@ -87,6 +89,8 @@ def finetune(
         seed: Of weights, scenes, exploration and batches; below 2^32.
         settings: Of the method.
         options: Task options that differ from the named task's, for studies.
+        curriculum: Learn on easier levels first, of which each player climbs by its own success;
+            evaluations are on the task itself. None for no easier ones.
         split: Stream of scenes to learn from; anything but ``test``.
         eval_every: Environment steps between evaluations; one more comes at start and end.
         eval_episodes: Scenes an evaluation, of the split ``validation``.
@@ -112,7 +116,8 @@ def finetune(
     prepare_process()
     identity = {
         "base": weights_digest(policy), "task": task, "task_version": spec.version,
-        "options": options, "split": split, "seed": seed, **dataclasses.asdict(settings),
+        "options": options, "split": split, "seed": seed,
+        "curriculum": curriculum, **dataclasses.asdict(settings),
     }  # fmt: skip
     training = out / "training"
     with contextlib.ExitStack() as stack:
@@ -127,7 +132,8 @@ def finetune(
 
         # What learns and what remembers.
         random = np.random.default_rng(seed)
-        make = MakeStage(task, options, split, str(policy.resolve()), settings, seed)
+        folder = str(policy.resolve())
+        make = MakeStage(task, options, split, folder, settings, seed, curriculum=curriculum)
         widths = {READ: residual.n_inputs, PRIVILEGED: make.n_privileged}
         learner = Learner(residual, widths[PRIVILEGED], settings)
         after = {f"next_{name}": width for name, width in widths.items()}
@@ -259,7 +265,8 @@ def finetune(
             seen = following
             for i in range(n):
                 actions = [] if over[i] else [*places[i].actions, action[i].tolist()]
-                places[i] = Place(int(info["episode"][i]), actions, int(info["played"][i]))
+                counted = {name: int(info[name][i]) for name in ("episode", "played", "level")}
+                places[i] = Place(actions=actions, recent=info["recent"][i], **counted)
                 if over[i]:
                     ended = info["final_info"]
                     names = ("success", "collision", "return", "length")

@@ -87,24 +87,27 @@ class Manifest:
         }
         return [key for key in self.features if key in wanted]
 
-    def with_inputs(self, names: Collection[str]) -> "Manifest":
+    def with_cameras(self, names: Collection[str], grey: Collection[str] = ()) -> "Manifest":
         """The same dataset for a policy that is given less.
 
         Args:
-            names: Cameras that are left, of ``eih`` and ``eth``.
+            names: Cameras that are left.
+            grey: Those of them whose pictures are in grey.
 
         Raises:
             OptionError: A name is unknown, or none is left.
         """
-        if unknown := sorted(set(names) - set(self.cameras)):
-            raise OptionError(
-                f"unknown input {unknown[0]!r}; choose from {', '.join(self.cameras)}"
-            )
+        for known, some in ((self.cameras, names), (names, grey)):
+            if unknown := sorted(set(some) - set(known)):
+                raise OptionError(f"unknown camera {unknown[0]!r}; choose from {', '.join(known)}")
         if not names:
             raise OptionError("no camera is left to see the target with; keep eih or eth")
         dropped = {IMAGES + name for name in self.cameras if name not in names}
         features = {key: value for key, value in self.features.items() if key not in dropped}
-        return dataclasses.replace(self, features=features)
+        for key in (IMAGES + name for name in grey):
+            features[key] = {**features[key], "shape": [*features[key]["shape"][:2], 1]}
+        options = {**self.options, **{f"{name}_channels": 1 for name in grey}}
+        return dataclasses.replace(self, features=features, options=options)
 
 
 def read_manifest(root: Path) -> Manifest:

@@ -287,7 +287,9 @@ def test_players_share_the_scenes_and_go_back_to_the_middle_of_one(base):
         stage.close()
     assert scenes == [0, 2, 1, 3]
     # The same again, from the middle of the last of them.
-    again = dataclasses.replace(make, place=Place(1, [action.tolist()] * 2, 5))()
+    again = dataclasses.replace(
+        make, place=Place(1, [action.tolist()] * 2, 5, 0, info["recent"][:-1])
+    )()
     again.reset()
     same, _, over, _, counted = again.step(action)
     again.close()
@@ -295,6 +297,21 @@ def test_players_share_the_scenes_and_go_back_to_the_middle_of_one(base):
     assert counted == info
     np.testing.assert_array_equal(same[READ], seen[READ])
     np.testing.assert_array_equal(same[PRIVILEGED], seen[PRIVILEGED])
+
+
+def test_players_climb_a_curriculum_and_are_put_back_on_their_level(base):
+    learnt = Place(recent=(True,) * 50)
+    make = MakeStage(TASK, OPTIONS, "train", str(base), SMALL, 0, 0, learnt, "tolerance")
+    stage, wanted = make(), hvs_suite.TASKS[TASK].depth_tolerance_mm
+    assert stage._env.spec.depth_tolerance_mm == 8 * wanted
+    _, info = stage.reset()
+    assert stage._env.spec.depth_tolerance_mm == 4 * wanted
+    assert (info["level"], info["recent"]) == (1, [])
+    stage.close()
+    again = dataclasses.replace(make, place=Place(level=3))()
+    again.reset()
+    assert again._env.spec.depth_tolerance_mm == wanted
+    again.close()
 
 
 def test_a_fine_tuned_policy_is_shipped_like_any_other(whole, tmp_path):

@@ -138,6 +138,30 @@ def test_a_policy_of_one_camera_has_no_more(dataset, tmp_path, camera):
     pretrain(dataset, tmp_path / "out", inputs=(camera,), **STEP)
     config = json.loads((tmp_path / "out/config.json").read_text())
     assert set(config["input_features"]) == {f"observation.images.{camera}", "observation.state"}
+    assert not config["reads_positions"]
+    assert not config["reads_velocities"]
+
+
+def test_a_policy_may_see_grey_where_the_dataset_has_colour(dataset, tmp_path):
+    pretrain(dataset, tmp_path / "out", grey=("eth",), **STEP)
+    config = json.loads((tmp_path / "out/config.json").read_text())
+    shapes = {key: feature["shape"] for key, feature in config["input_features"].items()}
+    assert shapes["observation.images.eth"] == [1, 28, 28]
+    assert shapes["observation.images.eih"] == [3, 28, 28]
+    manifest = read_manifest(dataset)
+    colour, grey = (
+        Demonstrations(each, tmp_path / name, 0).batch(np.arange(2))["observation.images.eth"]
+        for name, each in (
+            ("colour", manifest),
+            ("grey", manifest.with_cameras(("eth",), ("eth",))),
+        )
+    )
+    luma = colour[:, 0] * 0.299 + colour[:, 1] * 0.587 + colour[:, 2] * 0.114
+    np.testing.assert_allclose(grey[:, 0], luma, atol=0.51)
+    with pytest.raises(OptionError, match="unknown camera 'top'"):
+        pretrain(dataset, tmp_path / "other", grey=("top",), **STEP)
+    with pytest.raises(OptionError, match="unknown input 'top'"):
+        pretrain(dataset, tmp_path / "other", inputs=("top",), **STEP)
 
 
 def test_errors_weigh_by_the_tolerance_unless_told_otherwise(dataset, tmp_path):

@@ -1,0 +1,50 @@
+"""Thesis, D.6: what a curriculum buys RL that begins with few demonstrations.
+
+Budget: on one core 16,000 environment steps took 7 to 14 minutes
+(docs/experiments/first-design.md), evaluations 3 more. Three cells, from 25 and from 50
+demonstrations, with five seeds: 8 hours on one core, 4 on two.
+"""
+
+import dataclasses
+import typing
+
+from hvs_suite.eval.studies.grid import Cell, Plan
+from hvs_suite.eval.studies.training import Scenes
+from hvs_suite.eval.studies.ways import FEW, TRIAL, imitation, tuned
+from hvs_suite.policies.rl.curriculum import Kind
+
+TASK = "align-thesis"
+DEMONSTRATIONS = (25, 50)
+NONE = "no curriculum"
+
+
+def plan(*, quick: bool = False) -> Plan:
+    """Without a curriculum, and with each.
+
+    Args:
+        quick: Make everything in minutes, of next to no training.
+    """
+    kinds: dict[str, Kind | None] = {
+        NONE: None,
+        **{f"{kind} curriculum": kind for kind in typing.get_args(Kind)},
+    }
+    cells = []
+    for n in (TRIAL.demonstrations,) if quick else DEMONSTRATIONS:
+        base = imitation(TASK, TRIAL if quick else dataclasses.replace(FEW, demonstrations=n))
+        cells += [
+            Cell(
+                group=f"{TASK}, from {n} demonstrations",
+                name=name,
+                way=tuned(base, TASK, quick=quick, curriculum=kind),
+                on=[Scenes(task=TASK)],
+                against=None if kind is None else NONE,
+            )
+            for name, kind in kinds.items()
+        ]
+    return Plan(
+        name="curriculum",
+        question="What does a curriculum buy (D.6)?",
+        cells=cells,
+        seeds=1 if quick else 5,
+        episodes=2 if quick else 200,
+    )

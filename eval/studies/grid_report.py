@@ -1,0 +1,148 @@
+"""Table, words and picture of a study that a grid of cells makes."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from hvs_suite.eval.scoring.comparison import SIGNIFICANT
+from hvs_suite.eval.studies.grid import Row, Study
+from hvs_suite.eval.studies.training import SPLIT
+
+REFERENCE, OTHER = "#16803c", "#2b6cb0"
+
+
+def markdown(study: Study) -> str:
+    """Tables and words of what is finished."""
+    lines = [study.question]
+    for group in study.groups():
+        rows = study.rows(group)
+        n = len(rows[0].judged[0].solved)
+        lines += [
+            "",
+            f"## {group}",
+            "",
+            f"{n} scenes of split `{SPLIT}` a seed. Intervals are of 95 %, made of Wilson's; p is "
+            "of McNemar's exact test on the same scenes and seeds, after Holm's correction.",
+            "",
+            *_table(rows),
+            "",
+            *_words(rows),
+        ]
+    lines += ["", "The commands that make each policy again are in study.json, and in cells/."]
+    return "\n".join(lines) + "\n"
+
+
+def _table(rows: Sequence[Row]) -> list[str]:
+    several = len({row.scenes for row in rows}) > 1
+    metric = rows[0].judged[0].metric
+    heads = ["setting", *(["played"] if several else []), "solved", "95 % interval", "each seed"]
+    heads += ["collisions", "steps", f"settled {metric}"]
+    heads += ["compared with", "only it, only this", "p", "minutes"]
+    return [
+        f"| {' | '.join(heads)} |",
+        f"|{'---|' * len(heads)}",
+        *(f"| {' | '.join(_cells(row, several))} |" for row in rows),
+    ]
+
+
+def _cells(row: Row, several: bool) -> list[str]:
+    steps = [each.steps_to_goal for each in row.judged if each.steps_to_goal is not None]
+    compared = ["-", "-", "-"]
+    if row.p is not None:
+        compared = [str(row.cell[0].against), f"{row.only_other}, {row.only_this}", f"{row.p:.2g}"]
+    return [
+        row.name,
+        *([row.scenes] if several else []),
+        f"{row.rate:.1f} %",
+        f"{row.interval[0]:.1f} to {row.interval[1]:.1f} %",
+        ", ".join(f"{rate:.1f}" for rate in row.rates),
+        str(sum(each.n_collision for each in row.judged)),
+        f"{sum(steps) / len(steps):.1f}" if steps else "-",
+        f"{sum(each.settled for each in row.judged) / len(row.judged):.2f}",
+        *compared,
+        f"{sum(each.minutes for each in row.cell) / len(row.cell):.1f}",
+    ]
+
+
+def _words(rows: Sequence[Row]) -> list[str]:
+    """What the table says, one sentence for each thing that is compared."""
+    most = max(row.rate for row in rows)
+    best = "; ".join(_name(row, rows) for row in rows if row.rate == most)
+    lines = [f"- Most scenes are solved by {best}: {most:.1f} %." if most else "- None is solved."]
+    tested = [row for row in rows if row.p is not None]
+    for against in dict.fromkeys(row.cell[0].against for row in tested):
+        own = [row for row in tested if row.cell[0].against == against]
+        sure = [row for row in own if row.p is not None and row.p < SIGNIFICANT]
+        for words, some in (
+            ("more scenes", [row for row in sure if row.only_this > row.only_other]),
+            ("fewer scenes", [row for row in sure if row.only_this < row.only_other]),
+            (
+                "neither more nor fewer, as far as these scenes tell",
+                [r for r in own if r not in sure],
+            ),
+        ):
+            if some:
+                names = "; ".join(_name(row, rows) for row in some)
+                lines.append(f"- Compared with {against}, {words}: {names}.")
+    return lines
+
+
+def _name(row: Row, rows: Sequence[Row]) -> str:
+    several = len({each.scenes for each in rows}) > 1
+    return f"{row.name} (played {row.scenes})" if several else row.name
+
+
+def draw(study: Study) -> Any:
+    """A panel for each group: success with its interval, or a map where cells play several scenes.
+
+    Args:
+        study: What is finished; at least one cell.
+
+    Returns:
+        A ``matplotlib.figure.Figure``.
+    """
+    from matplotlib.figure import Figure
+
+    groups = {group: study.rows(group) for group in study.groups()}
+    heights = [0.9 + 0.34 * len({row.name for row in rows}) for rows in groups.values()]
+    figure = Figure(figsize=(7.6, sum(heights) + 0.3), dpi=130, layout="constrained")
+    panels = figure.subplots(len(groups), 1, squeeze=False, height_ratios=heights)[:, 0]
+    for axes, (group, rows) in zip(panels, groups.items(), strict=True):
+        if len({row.scenes for row in rows}) > 1:
+            _draw_map(axes, rows)
+        else:
+            _draw_bars(axes, rows[::-1])
+        axes.set_title(group, fontsize=10, loc="left")
+    return figure
+
+
+def _draw_bars(axes: Any, rows: Sequence[Row]) -> None:
+    rates = [row.rate for row in rows]
+    ends = (
+        [max(0.0, row.rate - row.interval[0]) for row in rows],
+        [max(0.0, row.interval[1] - row.rate) for row in rows],
+    )
+    colours = [REFERENCE if row.cell[0].against is None else OTHER for row in rows]
+    axes.barh([row.name for row in rows], rates, xerr=ends, color=colours, capsize=3)
+    for place, row in enumerate(rows):
+        # Behind the interval, where there is room whatever the rate.
+        axes.text(row.interval[1] + 1.5, place, f"{row.rate:.1f} %", va="center", fontsize=8)
+    axes.set(xlim=(0.0, 112.0), xticks=range(0, 101, 20))
+    axes.tick_params(labelsize=8)
+    axes.set_xlabel("solved (%), with its 95 % interval", fontsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _draw_map(axes: Any, rows: Sequence[Row]) -> None:
+    """Cells by scenes; what is darker was solved more often."""
+    names = list(dict.fromkeys(row.name for row in rows))
+    scenes = list(dict.fromkeys(row.scenes for row in rows))
+    rates = {(row.name, row.scenes): row.rate for row in rows}
+    table = [[rates.get((name, each), float("nan")) for each in scenes] for name in names]
+    axes.imshow(table, vmin=0.0, vmax=100.0, cmap="Blues", aspect="auto")
+    for y, line in enumerate(table):
+        for x, rate in enumerate(line):
+            colour = "white" if rate > 60.0 else "black"
+            axes.text(x, y, f"{rate:.0f}", ha="center", va="center", fontsize=8, color=colour)
+    axes.set_xticks(range(len(scenes)), scenes, fontsize=8)
+    axes.set_yticks(range(len(names)), names, fontsize=8)
+    axes.set_xlabel("played with; solved (%)", fontsize=8)

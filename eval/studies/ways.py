@@ -1,0 +1,321 @@
+"""Ways to make a policy for a study: each trains it, and says the commands that do the same.
+
+A way is plain data, so its digest names the folder of what was made by it: cells that share a
+recording or a base share the folder, and another budget lies beside the first.
+"""
+
+import dataclasses
+import hashlib
+import json
+import re
+import shlex
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from hvs_suite.eval.studies.training import POLICY, Note
+from hvs_suite.executor import Workers
+from hvs_suite.policies.rl.curriculum import Kind
+from hvs_suite.tasks.shared.option_types import to_text
+
+NOISE_RAD = 0.02
+"""As `hvs demo` records: without disturbance and starts near the goal little is learnt."""
+EVERYWHERE_M = 10.0
+"""How far from the goal fine-tuning moves it: a weak base may never come near."""
+RL_STEPS = 16_000
+"""Environment steps of RL in most studies, after which its curves rose little any more."""
+
+type Options = Mapping[str, Any]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Recording:
+    """Demonstrations of the expert.
+
+    Attributes:
+        task: Named task.
+        episodes: How many.
+        options: Task options that differ from it.
+    """
+
+    task: str
+    episodes: int
+    options: Options = dataclasses.field(default_factory=dict)
+
+    def folder(self, out: Path) -> Path:
+        """Where a study keeps it."""
+        return out / "data" / f"{self.task}-{self.episodes}-{digest(self)}"
+
+    def make(self, out: Path, workers: Workers, on_progress: Note) -> None:
+        """Record it into a study, or go on where that was interrupted."""
+        from hvs_suite.datasets.recorder import record
+
+        record(
+            self.task,
+            self.episodes,
+            "train",
+            self.folder(out),
+            self.options,
+            workers=workers,
+            noise=NOISE_RAD,
+            resume=True,
+            progress=on_progress,
+            command=self.command(out),
+        )
+
+    def command(self, out: Path) -> str:
+        """The command that records it."""
+        words = {"task": self.task, "episodes": self.episodes, "noise": NOISE_RAD}
+        return command("record", {**words, "out": self.folder(out), "option": self.options})
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Imitation:
+    """Behaviour cloning, with DAgger where its settings say so.
+
+    Attributes:
+        data: What to learn from: a recording of the study's own, or a dataset.
+        steps: Optimiser steps.
+        settings: Of `hvs_suite.policies.imitation.pretrain.pretrain`, where not the defaults.
+        eyes: Named task of whose shipped weights the eyes begin with; None for fresh ones.
+    """
+
+    data: Recording | Path
+    steps: int
+    settings: Options = dataclasses.field(default_factory=dict)
+    eyes: str | None = None
+
+    def data_folder(self, out: Path) -> Path:
+        """Where the demonstrations are."""
+        return self.data.folder(out) if isinstance(self.data, Recording) else self.data
+
+    def folder(self, out: Path, seed: int) -> Path:
+        """Where a study keeps the run."""
+        return out / "runs" / f"imitation-{digest(self)}-seed-{seed}"
+
+    def train(self, out: Path, seed: int, policy: Path, note: Note) -> None:
+        """Train into a folder, on one core."""
+        from hvs_suite.policies.catalogue import checkpoint_folder
+        from hvs_suite.policies.imitation.pretrain import pretrain
+
+        pretrain(
+            self.data_folder(out),
+            policy,
+            steps=self.steps,
+            eyes=None if self.eyes is None else checkpoint_folder("pretrained", self.eyes),
+            workers=1,
+            seed=seed,
+            on_progress=note,
+            **self.settings,
+        )
+
+    def commands(self, out: Path, seed: int) -> Iterator[str]:
+        """The commands that make the same policy."""
+        if isinstance(self.data, Recording):
+            yield self.data.command(out)
+        words = {"data": self.data_folder(out), "out": self.folder(out, seed) / POLICY}
+        yield command(
+            "pretrain",
+            {**words, "steps": self.steps, **self.settings, "eyes": self.eyes, "seed": seed},
+        )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Finetuning:
+    """RL on top of an imitated policy of the same seed.
+
+    Of start and end it keeps what was evaluated better, so harm shows as no help.
+
+    Attributes:
+        base: That policy.
+        task: Named task.
+        steps: Environment steps.
+        settings: Of `hvs_suite.policies.residual.settings.Settings`, where not the study's.
+        options: Task options that differ from the named task's.
+        curriculum: See `hvs_suite.policies.residual.td3.finetune`.
+        eval_episodes: Scenes of an evaluation at start and end, by which it keeps the better.
+    """
+
+    base: Imitation
+    task: str
+    steps: int
+    settings: Options = dataclasses.field(default_factory=dict)
+    options: Options = dataclasses.field(default_factory=dict)
+    curriculum: Kind | None = None
+    eval_episodes: int = 100
+
+    def folder(self, out: Path, seed: int) -> Path:
+        """Where a study keeps the run."""
+        return out / "runs" / f"finetuned-{digest(self)}-seed-{seed}"
+
+    def train(self, out: Path, seed: int, policy: Path, note: Note) -> None:
+        """Train into a folder, on one core."""
+        from hvs_suite.policies.residual.settings import Settings
+        from hvs_suite.policies.residual.td3 import finetune
+
+        finetune(
+            self.base.folder(out, seed) / POLICY,
+            self.task,
+            policy,
+            steps=self.steps,
+            seed=seed,
+            settings=Settings(**self._settings()),
+            options=self.options,
+            curriculum=self.curriculum,
+            eval_every=self.steps,
+            eval_episodes=self.eval_episodes,
+            on_progress=note,
+        )
+
+    def _settings(self) -> dict[str, Any]:
+        return {"environments": 1, "reach_m": EVERYWHERE_M, **self.settings}
+
+    def commands(self, out: Path, seed: int) -> Iterator[str]:
+        """The commands that make the same policy."""
+        yield from self.base.commands(out, seed)
+        words = {
+            "policy": self.base.folder(out, seed) / POLICY,
+            "task": self.task,
+            "out": self.folder(out, seed) / POLICY,
+            "steps": self.steps,
+            **self._settings(),
+            "curriculum": self.curriculum,
+            "eval_every": self.steps,
+            "eval_episodes": self.eval_episodes,
+            "seed": seed,
+            "option": self.options,
+        }
+        yield command("finetune", words)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Scratch:
+    """SAC from nothing, as the thesis had it.
+
+    Attributes:
+        task: Named task.
+        steps: Environment steps.
+        settings: Of `hvs_suite.policies.sac.settings.Settings`, where not the thesis's.
+        eval_episodes: Scenes of an evaluation at start and end.
+    """
+
+    task: str
+    steps: int
+    settings: Options = dataclasses.field(default_factory=dict)
+    eval_episodes: int = 20
+
+    def folder(self, out: Path, seed: int) -> Path:
+        """Where a study keeps the run."""
+        return out / "runs" / f"scratch-{digest(self)}-seed-{seed}"
+
+    def train(self, out: Path, seed: int, policy: Path, note: Note) -> None:
+        """Train into a folder, on one core."""
+        from hvs_suite.policies.sac.settings import Settings
+        from hvs_suite.policies.sac.training import train_sac
+
+        train_sac(
+            self.task,
+            policy,
+            steps=self.steps,
+            seed=seed,
+            settings=Settings(**self.settings),
+            eval_every=self.steps,
+            eval_episodes=self.eval_episodes,
+            on_progress=note,
+        )
+
+    def commands(self, out: Path, seed: int) -> Iterator[str]:
+        """The command that makes the same policy."""
+        words = {"task": self.task, "out": self.folder(out, seed) / POLICY, "steps": self.steps}
+        evaluated = {"eval_every": self.steps, "eval_episodes": self.eval_episodes}
+        yield command("train-sac", {**words, **self.settings, **evaluated, "seed": seed})
+
+
+type Way = Imitation | Finetuning | Scratch
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Effort:
+    """What an imitated policy costs.
+
+    Attributes:
+        demonstrations: Episodes to record.
+        steps: Optimiser steps.
+        dagger_rounds: Rounds of DAgger.
+        dagger_frames: Frames of each.
+        batch_size: Frames that the eyes learn from in a step.
+    """
+
+    demonstrations: int
+    steps: int
+    dagger_rounds: int = 0
+    dagger_frames: int = 3000
+    batch_size: int = 64
+
+
+TRIAL = Effort(demonstrations=4, steps=2, dagger_rounds=1, dagger_frames=8, batch_size=4)
+"""Next to no training, to try a study out."""
+FEW = Effort(demonstrations=50, steps=1000)
+"""What RL begins with in most studies: a policy that solves some scenes."""
+
+
+def imitation(
+    task: str, effort: Effort, options: Options = MappingProxyType({}), **settings: Any
+) -> Imitation:
+    """A policy that learns from a recording of its own.
+
+    Args:
+        task: Named task.
+        effort: What it costs.
+        options: Task options to record with; half of the arms start near the goal if they name no
+            other start.
+        **settings: Of `Imitation`, beside the effort's.
+    """
+    spent = dataclasses.asdict(effort)
+    n, steps = spent.pop("demonstrations"), spent.pop("steps")
+    data = Recording(task=task, episodes=n, options={"start": "mixed", **options})
+    return Imitation(data=data, steps=steps, settings={**spent, **settings})
+
+
+def tuned(base: Imitation, task: str, *, quick: bool, **options: Any) -> Finetuning:
+    """A policy that goes on by RL.
+
+    Args:
+        base: What it begins with.
+        task: Named task.
+        quick: Make next to no training of it.
+        **options: Of `Finetuning`.
+    """
+    way = Finetuning(base=base, task=task, steps=RL_STEPS, **options)
+    return dataclasses.replace(way, steps=40, eval_episodes=2) if quick else way
+
+
+def digest(plan: Any) -> str:
+    """Names a plan, a dataclass, by what it holds."""
+    content = json.dumps(dataclasses.asdict(plan), sort_keys=True, default=str)
+    return hashlib.sha256(content.encode()).hexdigest()[:8]
+
+
+def slug(words: str) -> str:
+    """Words as a part of a path."""
+    return re.sub(r"[^a-z0-9.]+", "-", words.lower()).strip("-")
+
+
+def command(name: str, words: Mapping[str, Any]) -> str:
+    """A command line of ``hvs``.
+
+    Args:
+        name: Of the command.
+        words: Values of its options; None leaves one out. Task options are a mapping, names that
+            ``+`` joins are tuples.
+    """
+    line = ["hvs", name]
+    for key, value in words.items():
+        if isinstance(value, Mapping):
+            for option, chosen in sorted(value.items()):
+                line += ["--option", f"{option}={to_text(chosen)}"]
+        elif value is not None:
+            text = "+".join(value) if isinstance(value, tuple) else str(value)
+            line += [f"--{key.replace('_', '-')}", text]
+    return shlex.join(line)
