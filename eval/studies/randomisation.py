@@ -4,8 +4,8 @@ Each policy is trained on ``align-hard`` with one disturbance, with none or with
 scenes of each of them. It is not told which.
 
 Budget: on one core 4,000 optimiser steps on ``align-hard`` took 14 minutes (metadata of the shipped
-weights' result). 5,000 steps, two rounds of DAgger, recording and six times 100 scenes come to 30
-minutes a cell: 9 hours for six cells and three seeds on one core, 4.5 on two.
+weights' result). 5,000 steps, two rounds of DAgger, recording and seven times 100 scenes come to 32
+minutes a cell: 11 hours for seven cells and three seeds on one core, 5.6 on two.
 """
 
 from collections.abc import Mapping
