@@ -231,11 +231,11 @@ def test_playing_on_changes_no_scenario() -> None:
 
 
 def test_the_action_log_holds_every_action(tmp_path: Path) -> None:
-    path = tmp_path / "zero.json"
-    result = protocol.evaluate("random", TASK, path, episodes=2)
+    path = tmp_path / "expert.json"
+    result = protocol.evaluate("expert", TASK, path, episodes=2)
     log = action_log.load(result_file.actions_path(path), result.metadata.actions_sha256)
     assert [len(actions) for actions in log] == [row.settled.steps for row in result.episodes]
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["zero.actions.npz", "zero.json"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["expert.actions.npz", "expert.json"]
 
 
 @pytest.mark.parametrize(
