@@ -1,5 +1,6 @@
 """The thesis's questions as studies, each a grid of trainings."""
 
+import abc
 import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Grid:
+class Grid(abc.ABC):
     """Options of all studies that train in several ways and compare.
 
     Attributes:
@@ -36,9 +37,9 @@ class Grid:
     processes: int | None = None
     ray: str | None = None
 
+    @abc.abstractmethod
     def plan(self) -> "Plan":
         """What the study makes."""
-        raise NotImplementedError
 
     def run(self) -> None:
         """Make it, showing how it goes; write and print what was found."""
