@@ -25,7 +25,7 @@ from hvs_suite.datasets.features import (
 )
 from hvs_suite.datasets.png import encode
 from hvs_suite.registry import load
-from hvs_suite.rollout import Policy, tell
+from hvs_suite.rollout import Policy, overrule, tell
 
 if TYPE_CHECKING:
     from hvs_suite.tasks.shared.environment import Environment, Moment
@@ -124,7 +124,10 @@ class Demonstrate:
             if self.looks:
                 # The expert keeps within the bounds by itself.
                 action = np.clip(action, -1.0, 1.0).astype(np.float32)
-            executed = action if perturbation is None else perturbation.apply(action)
+            executed = action
+            if perturbation is not None:
+                executed = perturbation.apply(action)
+                overrule(policy, executed)
             time_step = env.step(executed)
             frame |= acted_part(
                 action,

@@ -33,7 +33,7 @@ from hvs_suite.tasks.shared.spec import Spec
 LOGGED_OF_BUILTIN = 50
 """Scenarios that the log of a built-in policy holds: it can play the others again."""
 UNWATCHED = ("random", "zero")
-"""Nobody learns anything from watching these policies: one scenario is logged, and no clip drawn."""
+"""Nobody learns from watching these policies: one scenario is logged, and no clip is drawn."""
 
 Progress = Callable[[Trial], None]
 

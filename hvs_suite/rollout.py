@@ -50,6 +50,20 @@ def tell(policy: Any, env: Any) -> None:
         policy.instruct(env.instruction)
 
 
+@runtime_checkable
+class Overruled(Protocol):
+    """A policy that remembers its actions, and has to know when another one was executed."""
+
+    def overrule(self, action: Action) -> None:
+        """Takes in what was executed in place of its last action, (7,) in [-1, 1]."""
+
+
+def overrule(policy: Any, action: Action) -> None:
+    """Tells a policy that another action than its last was executed, if it listens."""
+    if isinstance(policy, Overruled):
+        policy.overrule(action)
+
+
 class Environment(Protocol):
     """What the executor needs from an environment; `hvs_suite.load` returns one."""
 

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from hvs_suite.cli import console
 from hvs_suite.cli.players import Players
@@ -28,9 +28,11 @@ class Pretrain(Players):
         out: Folder for the checkpoint; loads with from_pretrained.
         minutes: Stop after this much training, decoding not counted (min).
         steps: Stop after this many optimiser steps.
-        dagger_rounds: DAgger rounds, spread over the training: the policy plays, the expert labels
+        dagger_rounds: DAgger rounds, spread over the training: the policy plays, a teacher labels
             every step, and the frames are added. Their time comes on top of --minutes.
         dagger_frames: Frames a round.
+        dagger_teacher: Who labels them: the demonstrator, the expert, which also knows what nobody
+            can see, or servo, which knows no more than the policy.
         inputs: What the policy is given: eih, eth, joint_positions and joint_velocities, some of
             them joined by +; all by default. Without joint_positions it knows where the arm starts
             and what it has sent.
@@ -54,6 +56,7 @@ class Pretrain(Players):
     steps: int | None = None
     dagger_rounds: int = 0
     dagger_frames: int = 6000
+    dagger_teacher: Literal["demonstrator", "expert", "servo"] = "demonstrator"
     inputs: str | None = None
     grey: str | None = None
     episodes: int | None = None
@@ -80,6 +83,7 @@ class Pretrain(Players):
                 steps=self.steps,
                 dagger_rounds=self.dagger_rounds,
                 dagger_frames=self.dagger_frames,
+                dagger_teacher=self.dagger_teacher,
                 inputs=None if self.inputs is None else tuple(self.inputs.split("+")),
                 grey=() if self.grey is None else tuple(self.grey.split("+")),
                 episodes=self.episodes,

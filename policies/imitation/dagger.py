@@ -1,8 +1,11 @@
-"""DAgger: the policy plays, the expert says at every step what it would have done instead.
+"""DAgger: the policy plays, a teacher says at every step what it would have done instead.
 
-Cloning shows the policy only states of the expert's episodes, but small errors of the policy soon
-lead to other states. Frames of the policy's own episodes, labelled by the expert, fix that (Ross,
-Gordon and Bagnell, 2011: https://arxiv.org/abs/1011.0686).
+Cloning shows the policy only states of the demonstrator's episodes, but small errors of the policy
+soon lead to other states. Frames of the policy's own episodes, labelled by the teacher, fix that
+(Ross, Gordon and Bagnell, 2011: https://arxiv.org/abs/1011.0686).
+
+The teacher is the demonstrator, unless one asks for another: the expert, which knows even what
+nobody can see, or ``servo``, which knows no more than the policy.
 """
 
 import contextlib
@@ -11,14 +14,15 @@ import json
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.datasets.demonstration import MakeEnvironment
+from hvs_suite.datasets.expert import make_expert
 from hvs_suite.datasets.features import ACTION, ACTION_EXECUTED, IMAGES, Frame, observed_part
-from hvs_suite.datasets.looking import Demonstrator
+from hvs_suite.datasets.looking import make_demonstrator
 from hvs_suite.datasets.png import encode
 from hvs_suite.datasets.recorder import in_order
 from hvs_suite.errors import DatasetError, OutputError
@@ -26,9 +30,10 @@ from hvs_suite.executor import Workers
 from hvs_suite.policies.checkpoints.loading import CheckpointFactory
 from hvs_suite.policies.imitation.demonstrations import Recording
 from hvs_suite.policies.imitation.frame_cache import new_frames, open_frames
+from hvs_suite.policies.servo import make_servo
 from hvs_suite.policies.training.dataset import Manifest
 from hvs_suite.reading import decode_png
-from hvs_suite.rollout import Policy, play, tell
+from hvs_suite.rollout import Policy, PolicyFactory, overrule, play, tell
 
 if TYPE_CHECKING:
     from hvs_suite.tasks.shared.environment import Environment
@@ -37,6 +42,13 @@ FIRST_SHARE = 0.35
 LAST_SHARE = 0.80
 """The rounds are spread over this part of the training: before, the policy errs anyhow; after, no
 time would be left to learn from them."""
+TeacherName = Literal["demonstrator", "expert", "servo"]
+TEACHERS: Mapping[TeacherName, PolicyFactory] = {
+    "demonstrator": make_demonstrator,
+    "expert": make_expert,
+    "servo": make_servo,
+}
+"""Who can label frames."""
 COLUMNS = "columns.npz"
 SUMMARY = "round.json"
 
@@ -59,7 +71,7 @@ class PlayedEpisode:
 
     Attributes:
         scenario: Index in the split.
-        frames: One a control step, pictures left out, with the expert's ``action``.
+        frames: One a control step, pictures left out, with the teacher's ``action``.
         pictures: PNG files of each camera's feature, one a frame: they may come from far away.
         success: The goal was reached.
         collision: A forbidden contact ended it.
@@ -72,32 +84,36 @@ class PlayedEpisode:
     collision: bool
 
 
-def correct(env: "Environment", policy: Policy, scenario: int) -> PlayedEpisode:
-    """Play one scenario with the policy and label each frame by the expert.
+@dataclasses.dataclass(frozen=True)
+class Correct:
+    """Plays scenarios with the policy and labels each frame; for :func:`hvs_suite.rollout.play`.
 
-    Args:
-        env: The task.
-        policy: The policy that plays.
-        scenario: Index in the split.
-
-    Returns:
-        The episode.
+    Attributes:
+        teacher: One of `TEACHERS`.
     """
-    expert = Demonstrator(env)
-    time_step = env.reset(scenario=scenario)
-    tell(policy, env)
-    policy.reset()
-    frames: list[Frame] = []
-    while not time_step.last():
-        frame = observed_part(env.spec, time_step.observation, env)
-        frame[ACTION] = expert.label()
-        action = np.clip(policy.select_action(time_step.observation), -1.0, 1.0).astype(np.float32)
-        frames.append(frame | {ACTION_EXECUTED: action})
-        time_step = env.step(action)
-    cameras = [key for key in frames[0] if key.startswith(IMAGES)]
-    pictures = {key: encode([frame.pop(key) for frame in frames]) for key in cameras}
-    info = env.info
-    return PlayedEpisode(scenario, frames, pictures, info["is_success"], info["collision"])
+
+    teacher: TeacherName = "demonstrator"
+
+    def __call__(self, env: "Environment", policy: Policy, scenario: int) -> PlayedEpisode:
+        """Plays one scenario to its end."""
+        teacher = TEACHERS[self.teacher](env)
+        time_step = env.reset(scenario=scenario)
+        for each in (policy, teacher):
+            tell(each, env)
+            each.reset()
+        frames: list[Frame] = []
+        while not time_step.last():
+            seen = time_step.observation
+            frame = observed_part(env.spec, seen, env)
+            frame[ACTION] = teacher.select_action(seen)
+            action = np.clip(policy.select_action(seen), -1.0, 1.0).astype(np.float32)
+            overrule(teacher, action)
+            frames.append(frame | {ACTION_EXECUTED: action})
+            time_step = env.step(action)
+        cameras = [key for key in frames[0] if key.startswith(IMAGES)]
+        pictures = {key: encode([frame.pop(key) for frame in frames]) for key in cameras}
+        info = env.info
+        return PlayedEpisode(scenario, frames, pictures, info["is_success"], info["collision"])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,6 +145,7 @@ def play_round(
     frames: int,
     first_scenario: int,
     workers: Workers,
+    teacher: TeacherName = "demonstrator",
     on_frames: Callable[[int], None] | None = None,
 ) -> RoundSummary:
     """Play scenarios until enough frames are there, and keep them on disk.
@@ -140,6 +157,7 @@ def play_round(
         frames: How many to keep.
         first_scenario: Index to begin with; give one that the dataset does not hold.
         workers: Processes that play, or others elsewhere. The result is the same with any of them.
+        teacher: Who labels the frames, one of `TEACHERS`.
         on_frames: Called with the number of frames just kept.
 
     Returns:
@@ -155,7 +173,7 @@ def play_round(
         CheckpointFactory(str(checkpoint.resolve())),
         # No episode is without a frame, so these are enough.
         range(first_scenario, first_scenario + frames),
-        correct,
+        Correct(teacher),
         workers=workers,
     )
     try:

@@ -20,7 +20,13 @@ import torch
 from hvs_suite.errors import PolicyError
 from hvs_suite.executor import Workers, check_workers
 from hvs_suite.files import replacing
-from hvs_suite.policies.imitation.dagger import RoundSummary, play_round, read_round, round_shares
+from hvs_suite.policies.imitation.dagger import (
+    RoundSummary,
+    TeacherName,
+    play_round,
+    read_round,
+    round_shares,
+)
 from hvs_suite.policies.imitation.demonstrations import Demonstrations
 from hvs_suite.policies.imitation.settings import (
     Settings,
@@ -170,7 +176,11 @@ def pretrain(
             chosen,
             budget=budget,
             rounds=_Rounds(
-                training / "dagger", chosen.dagger_rounds, chosen.dagger_frames, workers
+                training / "dagger",
+                chosen.dagger_rounds,
+                chosen.dagger_frames,
+                chosen.dagger_teacher,
+                workers,
             ),
             checkpoint_period_s=checkpoint_period_s,
         )
@@ -184,6 +194,7 @@ class _Rounds:
     folder: Path
     count: int
     frames: int
+    teacher: TeacherName
     workers: Workers
 
     def path(self, number: int) -> Path:
@@ -360,6 +371,7 @@ class _Run:
             frames=rounds.frames,
             first_scenario=first,
             workers=rounds.workers,
+            teacher=rounds.teacher,
             on_frames=self._meter("playing", rounds.frames),
         )
         self._reopen(demonstrations, folder)

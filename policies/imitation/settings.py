@@ -16,6 +16,7 @@ from hvs_suite.policies.belief.cell_model import cell_model
 from hvs_suite.policies.belief.eye import Eye
 from hvs_suite.policies.belief.settings import as_numbers, further_keys
 from hvs_suite.policies.checkpoints.loading import load_network, weights_digest
+from hvs_suite.policies.imitation.dagger import TEACHERS, TeacherName
 from hvs_suite.policies.imitation.frame_cache import fingerprint
 from hvs_suite.policies.trained_for import trained_for
 from hvs_suite.policies.training.dataset import Manifest
@@ -36,9 +37,10 @@ class Settings:
         seed: Of initial weights, held-out episodes and order.
         batch_size: Frames a step.
         learning_rate: Peak of the schedule (a short warm-up, then a cosine to zero).
-        dagger_rounds: How often to let the policy play, the expert labelling every step, and to add
-            those frames.
+        dagger_rounds: How often to let the policy play, the teacher labelling every step, and to
+            add those frames.
         dagger_frames: Frames a round.
+        dagger_teacher: Who labels them, see `hvs_suite.policies.imitation.dagger.TEACHERS`.
         dataset: Fingerprint of the dataset.
         task: Named task that it was recorded on.
         inputs: What the policy is given of `INPUTS`, one camera or more; None for all.
@@ -55,6 +57,7 @@ class Settings:
     learning_rate: float = 2e-3
     dagger_rounds: int = 0
     dagger_frames: int = 6000
+    dagger_teacher: TeacherName = "demonstrator"
     dataset: str
     task: str
     inputs: tuple[str, ...] | None = None
@@ -87,10 +90,19 @@ class Settings:
             raise OptionError(f"learning_rate must be between 0 and 1, not {self.learning_rate}")
         if self.dagger_rounds < 0:
             raise OptionError(f"dagger_rounds must be 0 or more, not {self.dagger_rounds}")
-        if self.dagger_rounds and manifest.demonstrator != EXPERT:
+        if self.dagger_teacher not in TEACHERS:
             raise OptionError(
-                f"{manifest.root} was recorded with {manifest.demonstrator}, and the expert labels "
-                "the rounds of DAgger, which acts otherwise; leave --dagger-rounds out"
+                f"unknown teacher {self.dagger_teacher!r}; choose from {', '.join(TEACHERS)}"
+            )
+        if (
+            self.dagger_rounds
+            and self.dagger_teacher == "demonstrator"
+            and manifest.demonstrator != EXPERT
+        ):
+            raise OptionError(
+                f"{manifest.root} was recorded with {manifest.demonstrator}, and the demonstrator, "
+                "which would label the rounds of DAgger, acts otherwise; leave --dagger-rounds "
+                "out, or name another --dagger-teacher"
             )
         if self.episodes is not None and not 1 <= self.episodes <= manifest.n_episodes:
             raise OptionError(

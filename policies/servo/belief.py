@@ -59,6 +59,11 @@ class Belief:
         """Remember an action, (7,) in [-1, 1]."""
         self._commands.append(action.astype(np.float64) * JOINT_RANGE_RAD)
 
+    def overrule(self, action: npt.NDArray[np.float32]) -> None:
+        """Remember an action, (7,) in [-1, 1], in place of the last."""
+        self._commands.pop()
+        self.command(action)
+
     @property
     def latency_steps(self) -> int:
         """Control steps between a command and its effect, as far as it was noticed."""

@@ -131,6 +131,10 @@ class StillTargetServo:
         self._belief.command(action)
         return action
 
+    def overrule(self, action: npt.NDArray[np.float32]) -> None:
+        """Take in what was executed in place of the last action, (7,) in [-1, 1]."""
+        self._belief.overrule(action)
+
     def _next_set_point(self, q: FloatArray) -> FloatArray:
         """Where the set point (7,) shall be at the end of the control step."""
         goal, onward = self._aim(q)

@@ -1,4 +1,4 @@
-"""DAgger: the policy plays, the expert labels, and training goes on with those frames."""
+"""DAgger: the policy plays, a teacher labels, and training goes on with those frames."""
 
 import json
 from pathlib import Path
@@ -10,11 +10,14 @@ from safetensors.torch import load_file
 
 import hvs_suite
 from hvs_suite.datasets.expert import Expert
+from hvs_suite.datasets.features import ACTION_EXECUTED
 from hvs_suite.errors import OptionError
-from hvs_suite.policies.imitation.dagger import play_round, read_round, round_shares
+from hvs_suite.policies.imitation.dagger import Correct, play_round, read_round, round_shares
 from hvs_suite.policies.imitation.demonstrations import Demonstrations
 from hvs_suite.policies.imitation.pretrain import pretrain
+from hvs_suite.policies.servo import make_servo
 from hvs_suite.policies.training.dataset import read_manifest
+from hvs_suite.rollout import overrule
 
 SIDE = 28
 OPTIONS = {"eih_resolution": SIDE, "eth_resolution": SIDE}
@@ -38,9 +41,15 @@ def novice(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def play(data: Path, novice: Path, folder: Path, workers: int = 1):
+def play(data: Path, novice: Path, folder: Path, workers: int = 1, **more):
     return play_round(
-        read_manifest(data), novice, folder, frames=FRAMES, first_scenario=10, workers=workers
+        read_manifest(data),
+        novice,
+        folder,
+        frames=FRAMES,
+        first_scenario=10,
+        workers=workers,
+        **more,
     )
 
 
@@ -62,6 +71,54 @@ def test_a_round_holds_the_policys_states_and_the_experts_answers(data, novice, 
         # A novice does not go where the expert goes, so its second state is another one.
         env.step(columns["action"][0])
         assert np.abs(columns["observation.state"][1, :7] - env.joint_positions).max() > 0.01
+
+
+def test_servo_labels_what_it_would_do_where_the_policy_has_led_the_arm():
+    servo_alone = Correct("servo")
+    with hvs_suite.load("align-easy", split="train") as env:
+        # Where servo itself plays, it agrees with itself.
+        own = servo_alone(env, make_servo(env), 3)
+        assert own.success
+        for frame in own.frames:
+            np.testing.assert_array_equal(frame["action"], frame[ACTION_EXECUTED])
+        # Where the arm was led astray for some steps, it still arrives: it knows where the arm is.
+        led = LedAstray(make_servo(env))
+        led_home = servo_alone(env, led, 3)
+        assert led_home.success
+        assert len(led_home.frames) > len(own.frames)
+        for frame in led_home.frames[LedAstray.steps :]:
+            np.testing.assert_array_equal(frame["action"], frame[ACTION_EXECUTED])
+
+
+class LedAstray:
+    """A policy that stands still at first, and tells the other that it has."""
+
+    steps = 5
+
+    def __init__(self, policy):
+        self._policy = policy
+
+    def reset(self):
+        self._policy.reset()
+        self._count = 0
+
+    def select_action(self, observation):
+        action = self._policy.select_action(observation)
+        self._count += 1
+        if self._count <= self.steps:
+            action = np.zeros(7, np.float32)
+            overrule(self._policy, action)
+        return action
+
+
+def test_the_expert_as_a_teacher_knows_what_the_demonstrator_does_not_show():
+    with hvs_suite.load("insert-feel", split="train") as env:
+        labels = {}
+        for name in ("expert", "demonstrator"):
+            played = Correct(name)(env, make_servo(env), 0)
+            labels[name] = np.array([frame["action"] for frame in played.frames])
+    # Of the same states: one goes where the hole is, the other where the paint says.
+    assert np.abs(labels["expert"] - labels["demonstrator"])[-5:].max() > 1e-4
 
 
 def test_any_number_of_workers_plays_the_same_round(data, novice, tmp_path):
