@@ -20,6 +20,7 @@ from hvs_suite.eval.scoring.result_file import Result
 from hvs_suite.eval.studies.training import (
     POLICY,
     SPLIT,
+    Point,
     Report,
     Scenes,
     minutes,
@@ -167,6 +168,8 @@ class Finished(pydantic.BaseModel):
         seed: Of all that was drawn.
         commands: What makes and judges the same policy, line by line.
         minutes: Time of its training on one core, its base's and evaluations not counted (min).
+        curve: Success over the environment steps that it learned from, with its end, the first of
+            ``judged``; empty for a way that plays none.
         judged: One for each of the cell's scenes.
     """
 
@@ -176,6 +179,7 @@ class Finished(pydantic.BaseModel):
     seed: int
     commands: list[str]
     minutes: float
+    curve: list[Point] = []
     judged: list[Judged]
 
 
@@ -434,6 +438,7 @@ class Maker:
             scenarios=self.episodes,
             workers=1,
         )
+        judged = [Judged.of(*each) for each in zip(cell.on, results, strict=True)]
         finished = Finished(
             group=cell.group,
             name=cell.name,
@@ -441,7 +446,8 @@ class Maker:
             seed=seed,
             commands=self.commands(cell, seed),
             minutes=minutes(run),
-            judged=[Judged.of(*each) for each in zip(cell.on, results, strict=True)],
+            curve=_ended(cell.way.curve(self.out, seed), judged[0]),
+            judged=judged,
         )
         path = self.path(cell, seed)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -467,3 +473,12 @@ class Maker:
             for scenes in cell.on
         ]
         return [*cell.way.commands(self.shown, seed), *judge]
+
+
+def _ended(curve: Sequence[Point], end: Judged) -> list[Point]:
+    """A curve that ends with what was judged."""
+    if not curve:
+        return []
+    solved = end.solved.count("1")
+    last = Point(env_steps=curve[-1].env_steps, n=len(end.solved), n_success=solved)
+    return [*curve[:-1], last]

@@ -6,6 +6,7 @@ from typing import Any
 from hvs_suite.eval.scoring.comparison import SIGNIFICANT
 from hvs_suite.eval.studies.grid import Row, Study
 from hvs_suite.eval.studies.training import SPLIT
+from hvs_suite.statistics import mean_rate_interval
 
 REFERENCE, OTHER = "#16803c", "#2b6cb0"
 
@@ -94,6 +95,8 @@ def _name(row: Row, rows: Sequence[Row]) -> str:
 def draw(study: Study) -> Any:
     """A panel for each group: success with its interval, or a map where cells play several scenes.
 
+    Where success was followed over environment steps, its curves stand beside the panel.
+
     Args:
         study: What is finished; at least one cell.
 
@@ -103,16 +106,53 @@ def draw(study: Study) -> Any:
     from matplotlib.figure import Figure
 
     groups = {group: study.rows(group) for group in study.groups()}
-    heights = [0.9 + 0.34 * len({row.name for row in rows}) for rows in groups.values()]
-    figure = Figure(figsize=(7.6, sum(heights) + 0.3), dpi=130, layout="constrained")
-    panels = figure.subplots(len(groups), 1, squeeze=False, height_ratios=heights)[:, 0]
-    for axes, (group, rows) in zip(panels, groups.items(), strict=True):
+    followed = {name for name, rows in groups.items() if any(_points(row) > 2 for row in rows)}
+    heights = [
+        max(0.9 + 0.34 * len({row.name for row in rows}), 2.6 if group in followed else 0.0)
+        for group, rows in groups.items()
+    ]
+    n_columns = 2 if followed else 1
+    figure = Figure(figsize=(5.2 * n_columns + 2.4, sum(heights) + 0.3), layout="constrained")
+    figure.set_dpi(130)
+    panels = figure.subplots(len(groups), n_columns, squeeze=False, height_ratios=heights)
+    for (axes, *beside), (group, rows) in zip(panels, groups.items(), strict=True):
         if len({row.scenes for row in rows}) > 1:
             _draw_map(axes, rows)
         else:
             _draw_bars(axes, rows[::-1])
         axes.set_title(group, fontsize=10, loc="left")
+        for each in beside:
+            if group in followed:
+                _draw_curves(each, [row for row in rows if _points(row) > 1])
+            else:
+                each.set_axis_off()
     return figure
+
+
+def _points(row: Row) -> int:
+    """How many points the curve of each seed has at least."""
+    return min(len(each.curve) for each in row.cell)
+
+
+def _draw_curves(axes: Any, rows: Sequence[Row]) -> None:
+    """Mean success of the seeds over environment steps, with its 95 % interval."""
+    for row in rows:
+        curves = [{point.env_steps: point for point in each.curve} for each in row.cell]
+        # A run that was ended early has fewer points than its sisters.
+        steps = sorted(set.intersection(*map(set, curves)))
+        counts = [[(c[at].n_success, c[at].n) for c in curves] for at in steps]
+        means = [100.0 * sum(k / n for k, n in each) / len(each) for each in counts]
+        low, high = zip(*map(mean_rate_interval, counts), strict=True)
+        thousands = [at / 1000.0 for at in steps]
+        [line] = axes.plot(thousands, means, marker="o", markersize=3, label=row.name)
+        axes.fill_between(thousands, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
+    axes.set_xlabel("environment steps (thousands)", fontsize=8)
+    axes.set_ylabel("solved (%)", fontsize=8)
+    axes.set_ylim(-2.0, 102.0)
+    axes.tick_params(labelsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(axis="y", color="#e4e4e2", linewidth=0.6)
+    axes.legend(fontsize=7, frameon=False)
 
 
 def _draw_bars(axes: Any, rows: Sequence[Row]) -> None:

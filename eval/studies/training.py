@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pydantic
+
 from hvs_suite.errors import ResultError
 from hvs_suite.eval import protocol
 from hvs_suite.eval.scoring import result_file
@@ -43,6 +45,20 @@ class Scenes:
     task: str
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     name: str = SPLIT
+
+
+class Point(pydantic.BaseModel):
+    """Success after some environment steps.
+
+    Attributes:
+        env_steps: Played so far.
+        n: Scenes.
+        n_success: Solved.
+    """
+
+    env_steps: int
+    n: int
+    n_success: int
 
 
 def train_and_judge(
@@ -146,3 +162,31 @@ def _judged(
         workers=workers,
         progress=note,
     )
+
+
+def evaluated(run: Path) -> list[Point]:
+    """How RL did on its way, on scenes of ``validation``."""
+    text = (run / POLICY / "training" / "evaluations.json").read_text(encoding="utf-8")
+    return [
+        Point(
+            env_steps=row["env_steps"],
+            n=row["episodes"],
+            n_success=round(row["success_rate"] * row["episodes"]),
+        )
+        for row in json.loads(text)
+    ]
+
+
+def played_rounds(run: Path) -> list[Point]:
+    """How DAgger did on its way, on each round's own scenes before it learned from them.
+
+    The last is the end, of which only the steps are known here. What the first round plays has
+    learned more than a base, and has no steps yet: it is left out.
+    """
+    rounds = json.loads((run / TRAINED).read_text(encoding="utf-8"))["rounds"]
+    points, env_steps = [], 0
+    for each in rounds:
+        point = Point(env_steps=env_steps, n=each["episodes"], n_success=each["successes"])
+        points.append(point)
+        env_steps += each["frames"]
+    return [*points[1:], Point(env_steps=env_steps, n=0, n_success=0)] if points else []

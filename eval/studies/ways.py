@@ -14,7 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from hvs_suite.eval.studies.training import POLICY, Note
+from hvs_suite.eval.studies.training import POLICY, Note, Point, evaluated, played_rounds
 from hvs_suite.executor import Workers
 from hvs_suite.policies.rl.curriculum import Kind
 from hvs_suite.tasks.shared.option_types import to_text
@@ -120,6 +120,10 @@ class Imitation:
             {**words, "steps": self.steps, **self.settings, "eyes": self.eyes, "seed": seed},
         )
 
+    def curve(self, out: Path, seed: int) -> list[Point]:
+        """Success over environment steps; see `played_rounds`."""
+        return played_rounds(self.folder(out, seed))
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Finetuning:
@@ -134,7 +138,8 @@ class Finetuning:
         settings: Of `hvs_suite.policies.residual.settings.Settings`, where not the study's.
         options: Task options that differ from the named task's.
         curriculum: See `hvs_suite.policies.residual.td3.finetune`.
-        eval_episodes: Scenes of an evaluation at start and end, by which it keeps the better.
+        evaluations: How many there are after the one at the start; it keeps the best.
+        eval_episodes: Scenes of each.
     """
 
     base: Imitation
@@ -143,6 +148,7 @@ class Finetuning:
     settings: Options = dataclasses.field(default_factory=dict)
     options: Options = dataclasses.field(default_factory=dict)
     curriculum: Kind | None = None
+    evaluations: int = 1
     eval_episodes: int = 100
 
     def folder(self, out: Path, seed: int) -> Path:
@@ -163,7 +169,7 @@ class Finetuning:
             settings=Settings(**self._settings()),
             options=self.options,
             curriculum=self.curriculum,
-            eval_every=self.steps,
+            eval_every=_period(self.steps, self.evaluations),
             eval_episodes=self.eval_episodes,
             on_progress=note,
         )
@@ -181,12 +187,16 @@ class Finetuning:
             "steps": self.steps,
             **self._settings(),
             "curriculum": self.curriculum,
-            "eval_every": self.steps,
+            "eval_every": _period(self.steps, self.evaluations),
             "eval_episodes": self.eval_episodes,
             "seed": seed,
             "option": self.options,
         }
         yield command("finetune", words)
+
+    def curve(self, out: Path, seed: int) -> list[Point]:
+        """Success over environment steps."""
+        return evaluated(self.folder(out, seed))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -197,12 +207,14 @@ class Scratch:
         task: Named task.
         steps: Environment steps.
         settings: Of `hvs_suite.policies.sac.settings.Settings`, where not the thesis's.
-        eval_episodes: Scenes of an evaluation at start and end.
+        evaluations: How many there are after the one at the start.
+        eval_episodes: Scenes of each.
     """
 
     task: str
     steps: int
     settings: Options = dataclasses.field(default_factory=dict)
+    evaluations: int = 1
     eval_episodes: int = 20
 
     def folder(self, out: Path, seed: int) -> Path:
@@ -220,7 +232,7 @@ class Scratch:
             steps=self.steps,
             seed=seed,
             settings=Settings(**self.settings),
-            eval_every=self.steps,
+            eval_every=_period(self.steps, self.evaluations),
             eval_episodes=self.eval_episodes,
             on_progress=note,
         )
@@ -228,8 +240,17 @@ class Scratch:
     def commands(self, out: Path, seed: int) -> Iterator[str]:
         """The command that makes the same policy."""
         words = {"task": self.task, "out": self.folder(out, seed) / POLICY, "steps": self.steps}
-        evaluated = {"eval_every": self.steps, "eval_episodes": self.eval_episodes}
-        yield command("train-sac", {**words, **self.settings, **evaluated, "seed": seed})
+        every = _period(self.steps, self.evaluations)
+        judged = {"eval_every": every, "eval_episodes": self.eval_episodes}
+        yield command("train-sac", {**words, **self.settings, **judged, "seed": seed})
+
+    def curve(self, out: Path, seed: int) -> list[Point]:
+        """Success over environment steps."""
+        return evaluated(self.folder(out, seed))
+
+
+def _period(steps: int, evaluations: int) -> int:
+    return max(1, steps // evaluations)
 
 
 type Way = Imitation | Finetuning | Scratch

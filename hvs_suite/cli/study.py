@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from hvs_suite.cli import console, study_files, study_grids, study_search
-from hvs_suite.cli.players import Players, players
+from hvs_suite.cli.players import Players
 from hvs_suite.errors import OptionError
 
 # As `hvs demo` records: without disturbance and starts near the goal nothing is learnt.
@@ -78,80 +78,6 @@ class Compression(Players):
             resume=True,
         ).run()
         return data
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FewDemonstrations:
-    """Measure what RL adds where demonstrations are few, against two controls.
-
-    Bases learn from a few demonstrations by cloning alone. From each, RL fine-tuning and DAgger get
-    the same number of environment steps; RL from scratch gets them without a base. Interrupted, the
-    same command goes on; tables and picture show what is finished so far, and study.json alone is
-    enough to go on with other numbers of demonstrations on another machine.
-
-    Attributes:
-        data: Recorded dataset; its task is played.
-        out: Folder of the study: study.json, study.md, study.png, and a sub-folder a run.
-        demonstrations: How many to learn from; give it several times; 25, 50, 100 and 200 by
-            default.
-        env_steps: Environment steps of each way.
-        base_steps: Optimiser steps of each base.
-        imitation_steps: Optimiser steps of DAgger, its base's included.
-        imitation_rounds: Rounds that its environment steps are spread over.
-        seeds: Runs of everything.
-        episodes: Scenes of split dev that bases and ends are judged on.
-        processes: Processes that make runs side by side, each on one core; without it 2, or with
-            --ray one for each core of the cluster.
-        ray: Make runs on a Ray cluster, whose machines see DATA and OUT under the same names
-            (docs/many-machines.md): auto, an address such as 10.0.0.1:6379, or local.
-    """
-
-    data: Path
-    out: Path
-    demonstrations: tuple[int, ...] = ()
-    env_steps: int = 16_000
-    base_steps: int = 1_000
-    imitation_steps: int = 2_500
-    imitation_rounds: int = 4
-    seeds: int = 3
-    episodes: int = 200
-    processes: int | None = None
-    ray: str | None = None
-
-    def run(self) -> None:
-        """Train and judge, showing how it goes; write and print what was found."""
-        from hvs_suite.eval.studies import few_demonstrations, few_demonstrations_report
-        from hvs_suite.files import check_writable
-
-        check_writable(self.out / "study.json")
-        budget = few_demonstrations.Budget(
-            env_steps=self.env_steps,
-            base_steps=self.base_steps,
-            imitation_steps=self.imitation_steps,
-            imitation_rounds=self.imitation_rounds,
-            episodes=self.episodes,
-        )
-        counts = self.demonstrations or (25, 50, 100, 200)
-
-        def write(study: few_demonstrations.Study) -> str:
-            text = few_demonstrations_report.markdown(study)
-            # RL from scratch has no place of its own: it is a control of each base.
-            if study.counts():
-                study_files.write_report(self.out, text, few_demonstrations_report.draw(study))
-            return text
-
-        with console.meter() as update:
-            study = few_demonstrations.run_study(
-                self.data,
-                self.out,
-                counts,
-                budget,
-                update,
-                seeds=self.seeds,
-                workers=players(self.processes, self.ray, local=2),
-                on_finished=write,
-            )
-        study_files.say(self.out, write(study))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -271,7 +197,7 @@ class Study:
         | Annotated[study_grids.CurriculumStudy, tyro.conf.subcommand("curriculum")]
         | Annotated[study_search.SearchStudy, tyro.conf.subcommand("search")]
         | Annotated[study_grids.ThesisRuns, tyro.conf.subcommand("thesis-runs")]
-        | Annotated[FewDemonstrations, tyro.conf.subcommand("few-demonstrations")]
+        | Annotated[study_grids.FewDemonstrations, tyro.conf.subcommand("few-demonstrations")]
         | Annotated[Robustness, tyro.conf.subcommand("robustness")]
         | Annotated[Attention, tyro.conf.subcommand("attention")],
         tyro.conf.OmitSubcommandPrefixes,

@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from hvs_suite.cli import console, study_files
 from hvs_suite.cli.players import players
@@ -217,6 +217,58 @@ class Ablation(Grid):
             steps=self.steps,
             dagger_rounds=self.dagger_rounds,
             dagger_frames=self.dagger_frames,
+            episodes=self.episodes,
+            quick=self.quick,
+        )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FewDemonstrations(Grid):
+    """Measure what RL adds where demonstrations are few, and what DAgger does.
+
+    Bases learn from a few demonstrations by cloning alone. From each, RL fine-tuning and DAgger get
+    the same number of environment steps; RL from scratch gets them without a base. Interrupted, the
+    same command goes on.
+
+    Attributes:
+        data: Recorded dataset; its task is played.
+        demonstrations: How many to learn from; give it several times; 25, 50, 100 and 200 by
+            default.
+        teacher: Who labels the steps of DAgger; give it several times; the demonstrator by default.
+        env_steps: Environment steps of each way.
+        base_steps: Optimiser steps of each base.
+        imitation_steps: Optimiser steps of DAgger, its base's included.
+        imitation_rounds: Rounds that its environment steps are spread over.
+        reach_m: How far from the goal fine-tuning moves it (m).
+        eyes: Named task of whose shipped weights all eyes begin with; fresh ones by default.
+        episodes: Scenes of split dev that bases and ends are judged on.
+    """
+
+    data: Path
+    demonstrations: tuple[int, ...] = ()
+    teacher: tuple[Literal["demonstrator", "expert", "servo"], ...] = ()
+    env_steps: int = 16_000
+    base_steps: int = 1_000
+    imitation_steps: int = 2_500
+    imitation_rounds: int = 4
+    reach_m: float = 10.0
+    eyes: str | None = None
+    episodes: int = 200
+
+    def plan(self) -> "Plan":
+        """Bases, what comes of each, and RL without one."""
+        from hvs_suite.eval.studies import few_demonstrations
+
+        return few_demonstrations.plan(
+            self.data,
+            demonstrations=self.demonstrations or (25, 50, 100, 200),
+            teachers=self.teacher or ("demonstrator",),
+            env_steps=self.env_steps,
+            base_steps=self.base_steps,
+            imitation_steps=self.imitation_steps,
+            imitation_rounds=self.imitation_rounds,
+            reach_m=self.reach_m,
+            eyes=self.eyes,
             episodes=self.episodes,
             quick=self.quick,
         )

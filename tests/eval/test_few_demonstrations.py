@@ -1,7 +1,5 @@
 """From a few demonstrations: RL and its controls from the same bases, judged on the same scenes."""
 
-import dataclasses
-import shutil
 import signal
 import subprocess
 import sys
@@ -10,162 +8,78 @@ from pathlib import Path
 import pytest
 
 from hvs_suite.cli.main import run
-from hvs_suite.errors import OptionError, OutputError
-from hvs_suite.eval.studies import few_demonstrations_report
-from hvs_suite.eval.studies.few_demonstrations import (
-    BASE,
-    FINETUNED,
-    IMITATED,
-    SCRATCH,
-    Budget,
-    Curve,
-    End,
-    Family,
-    Point,
-    Study,
-    run_study,
-)
+from hvs_suite.eval.studies import grid_report
+from hvs_suite.eval.studies.few_demonstrations import BASE, FINETUNED, SCRATCH
+from hvs_suite.eval.studies.grid import Finished, Judged, Study
+from hvs_suite.eval.studies.training import Point
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "align-thesis"
-BUDGET = Budget(
-    env_steps=120, base_steps=2, imitation_steps=3, imitation_rounds=2, episodes=2
-)  # fmt: skip
+WORDS = ["study", "few-demonstrations", "--data", str(SAMPLE), "--seeds", "1", "--processes", "1"]
+TEACHERS = ["--teacher", "demonstrator", "--teacher", "servo"]
 pytestmark = pytest.mark.timeout(600)
 
 
-def test_every_way_has_the_same_steps_and_is_not_made_twice(tmp_path):
-    so_far = []
+def test_every_way_has_the_same_steps_and_is_not_made_twice(tmp_path, capsys):
+    words = [*WORDS, *TEACHERS, "--quick", "--out", str(tmp_path)]
+    assert run(words) == 0
+    study = Study.model_validate_json((tmp_path / "study.json").read_text())
+    cells = {cell.name: cell for cell in study.finished}
+    ways = [FINETUNED, "DAgger, demonstrator", "DAgger, servo"]
+    assert list(cells) == [BASE, *ways, SCRATCH]
+    assert not cells[BASE].curve
+    for name in (*ways, SCRATCH):
+        steps = [point.env_steps for point in cells[name].curve]
+        assert steps[-1] == 120
+        assert steps == sorted({*steps})
+        assert cells[name].curve[-1].n_success == cells[name].judged[0].solved.count("1")
+    # RL and DAgger begin with the same demonstrations; the labels are another teacher's.
+    demonstrator, servo = (cells[name].commands[-2] for name in ways[1:])
+    assert demonstrator.replace("demonstrator", "servo").split("--out")[0] in servo
+    text = (tmp_path / "study.md").read_text()
+    assert "## align-thesis, 3 demonstrations" in text
+    assert text in capsys.readouterr().out
+    written = {path: path.stat().st_mtime_ns for path in tmp_path.glob("cells/*.json")}
+    assert run(words) == 0
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("cells/*.json")} == written
 
-    def on_finished(study):
-        so_far.append(len(study.families))
 
-    study = run_study(
-        SAMPLE, tmp_path / "a", [3], BUDGET, lambda *words: None, seeds=1, on_finished=on_finished
-    )
-    assert so_far == [1, 2]
-    assert study.counts() == [3]
-    ways = study.of(3)[0].curves | study.of(0)[0].curves
-    assert set(ways) == {FINETUNED, IMITATED, SCRATCH}
-    for curve in ways.values():
-        assert curve.points[-1].env_steps == BUDGET.env_steps
-        steps = [point.env_steps for point in curve.points]
-        assert steps == sorted(steps)
-    # Both begin with the same base.
-    assert ways[FINETUNED].points[0] == ways[IMITATED].points[0]
-    for family in study.families:
-        for way, curve in family.curves.items():
-            assert len(family.ends[way].solved) == BUDGET.episodes
-            assert family.ends[way].solved.count("1") == curve.points[-1].n_success
-    assert [(row.way, row.other) for row in study.comparisons()] == [
-        (FINETUNED, BASE), (IMITATED, BASE), (FINETUNED, IMITATED),
-    ]  # fmt: skip
-    # Its file is all that it needs to go on elsewhere.
-    (tmp_path / "b").mkdir()
-    shutil.copy(tmp_path / "a" / "study.json", tmp_path / "b")
-    again = []
-    for _ in range(2):
-        moved = run_study(
-            SAMPLE, tmp_path / "b", [3], BUDGET, lambda *w: again.append(w[0]), seeds=1
+def test_success_is_drawn_over_environment_steps_as_far_as_every_seed_came():
+    def cell(name, seed, *solved):
+        points = [
+            Point(env_steps=100 * i, n=2, n_success=n_success) for i, n_success in enumerate(solved)
+        ]
+        end = Judged(
+            scenes="dev", solved="10", n_collision=0, steps_to_goal=9.0, settled=1.0, metric="e, mm"
         )
-        assert moved == study
-    assert not again
-    text = few_demonstrations_report.markdown(study)
-    assert "| 3 |" in text
-    figure = few_demonstrations_report.draw(study)
-    assert [axes.get_title(loc="left") for axes in figure.axes] == ["3 demonstrations"]
-    assert len(figure.axes[0].lines) == 3
-
-
-def _family(count: int, seed: int, *, tuned: int) -> Family:
-    """What might have come of a base that solves one scene of two."""
-
-    def curve(solved: int) -> Curve:
-        points = [Point(env_steps=at, n=2, n_success=n) for at, n in ((0, 1), (120, solved))]
-        return Curve(points=points, minutes=1.0)
-
-    def end(solved: int) -> End:
-        return End(solved="1" * solved + "0" * (2 - solved), n_collision=0)
-
-    if not count:
-        return Family(
-            demonstrations=0, seed=seed, curves={SCRATCH: curve(0)}, ends={SCRATCH: end(0)}
+        return Finished(
+            group="g",
+            name=name,
+            against=None,
+            seed=seed,
+            commands=[],
+            minutes=1.0,
+            curve=points,
+            judged=[end],
         )
-    return Family(
-        demonstrations=count,
-        seed=seed,
-        curves={FINETUNED: curve(tuned), IMITATED: curve(2)},
-        ends={BASE: end(1), FINETUNED: end(tuned), IMITATED: end(2)},
-    )
 
-
-@pytest.fixture
-def kept(tmp_path):
-    """The folder of a study that is finished for two seeds of 3 demonstrations, and one of 4."""
-    families = [_family(0, 0, tuned=0), _family(0, 1, tuned=0)]
-    families += [_family(3, 0, tuned=1), _family(3, 1, tuned=2), _family(4, 0, tuned=2)]
-    study = Study(task="align-thesis", budget=BUDGET, families=families)
-    (tmp_path / "study.json").write_text(study.model_dump_json())
-    return tmp_path
-
-
-def test_all_that_is_finished_is_reported(kept):
-    def refuse(*words):
-        raise AssertionError(f"nothing is left to do, but {words}")
-
-    study = run_study(SAMPLE, kept, [3], BUDGET, refuse, seeds=2)
-    # Of 4 scenes 2 by the bases, 3 by the fine-tuned, 4 by DAgger; then the same of 2 scenes.
-    assert [(row.n_only_way, row.n_only_other) for row in study.comparisons()] == [
-        (1, 0), (2, 0), (0, 1), (1, 0), (1, 0), (0, 0),
-    ]  # fmt: skip
-    text = few_demonstrations_report.markdown(study)
-    assert "| 3 | 2 | 50.0 %" in text
-    assert "| 4 | 1 | 50.0 %" in text
-    assert len(few_demonstrations_report.draw(study).axes) == 2
-
-
-def test_a_study_that_is_finished_is_reported_at_once(kept, capsys):
-    words = ["study", "few-demonstrations", "--data", str(SAMPLE), "--out", str(kept)]
-    budget = [
-        word
-        for name, number in dataclasses.asdict(BUDGET).items()
-        for word in (f"--{name.replace('_', '-')}", str(number))
-    ]
-    before = (kept / "study.json").read_text()
-    assert run([*words, "--demonstrations", "3", "--seeds", "2", *budget]) == 0
-    assert (kept / "study.json").read_text() == before
-    text = (kept / "study.md").read_text()
-    assert "| 4 | 1 | 50.0 %" in text
-    assert capsys.readouterr().out.startswith(text)
-    assert (kept / "study.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_what_is_finished_is_reported_before_its_control_is():
-    study = Study(task="align-thesis", budget=BUDGET, families=[_family(3, 0, tuned=1)])
-    text = few_demonstrations_report.markdown(study)
-    assert text.count("| 3 | 1 | 50.0 %") == 1
-    assert text.splitlines()[4].endswith("|  |")
-    assert len(few_demonstrations_report.draw(study).axes[0].lines) == 2
-
-
-def test_another_study_in_the_folder_is_left_alone(kept):
-    before = (kept / "study.json").read_text()
-    other = dataclasses.replace(BUDGET, episodes=3)
-    with pytest.raises(OutputError, match="budget"):
-        run_study(SAMPLE, kept, [3], other, lambda *words: None)
-    assert (kept / "study.json").read_text() == before
-    (kept / "study.json").write_text("{}")
-    with pytest.raises(OutputError, match="another folder"):
-        run_study(SAMPLE, kept, [3], BUDGET, lambda *words: None)
+    cells = [cell("base", 0), cell("base", 1), cell("RL", 0, 0, 1, 2), cell("RL", 1, 0, 0, 1, 2)]
+    bars, curves = grid_report.draw(Study(name="s", question="?", finished=cells)).axes
+    assert [each.get_text() for each in bars.get_yticklabels()] == ["RL", "base"]
+    [line] = curves.lines
+    assert line.get_xdata().tolist() == [0.0, 0.1, 0.2]
+    assert line.get_ydata().tolist() == [0.0, 25.0, 75.0]
 
 
 def test_its_processes_end_with_a_study_that_is_killed(tmp_path):
-    endless = dataclasses.replace(BUDGET, base_steps=10**6)
     script = (
         "import os, signal\n"
         "from pathlib import Path\n"
-        "from hvs_suite.eval.studies.few_demonstrations import Budget, run_study\n"
+        "from hvs_suite.eval.studies.few_demonstrations import plan\n"
+        "from hvs_suite.eval.studies.grid import run_grid\n"
         "def stop(*words): os.kill(os.getpid(), signal.SIGKILL)\n"
-        f"run_study(Path({str(SAMPLE)!r}), Path({str(tmp_path)!r}), [3], {endless}, stop)\n"
+        f"made = plan(Path({str(SAMPLE)!r}), demonstrations=[3], teachers=[], env_steps=120,\n"
+        "    base_steps=10**6, imitation_steps=3, imitation_rounds=2, episodes=2)\n"
+        f"run_grid(made, Path({str(tmp_path)!r}), stop, workers=2)\n"
     )
     # What it prints has an end only once all that could print have ended.
     killed = subprocess.run(
@@ -174,19 +88,16 @@ def test_its_processes_end_with_a_study_that_is_killed(tmp_path):
     assert killed.returncode == -signal.SIGKILL
 
 
-@pytest.mark.parametrize("change", [{"episodes": 0}, {"env_steps": 1}])
-def test_a_budget_that_makes_no_sense_is_refused(change):
-    with pytest.raises(OptionError):
-        dataclasses.replace(BUDGET, **change)
-
-
-@pytest.mark.parametrize("count", [1, 6])
-def test_more_demonstrations_than_there_are_are_refused(count, tmp_path):
-    with pytest.raises(OptionError, match="dataset's 5"):
-        run_study(SAMPLE, tmp_path, [count], BUDGET, lambda *words: None)
-
-
-@pytest.mark.parametrize("none", [{"seeds": 0}, {"workers": 0}])
-def test_a_study_of_nothing_is_refused(none, tmp_path):
-    with pytest.raises(OptionError, match=r"at least 1, not 0"):
-        run_study(SAMPLE, tmp_path, [3], BUDGET, lambda *words: None, **none)
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["--demonstrations", "1"], "dataset's 5"),
+        (["--demonstrations", "6"], "dataset's 5"),
+        (["--env-steps", "3", "--demonstrations", "3"], "at least imitation_rounds"),
+        (["--base-steps", "0", "--demonstrations", "3"], "base_steps must be at least 1"),
+        (["--episodes", "0", "--demonstrations", "3"], "episodes must be at least 1"),
+    ],
+)
+def test_nonsense_is_refused(words, reason, tmp_path, capsys):
+    assert run([*WORDS, *words, "--out", str(tmp_path)]) == 2
+    assert reason in capsys.readouterr().err

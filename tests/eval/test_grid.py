@@ -14,6 +14,7 @@ from hvs_suite.eval.scoring import result_file
 from hvs_suite.eval.studies import (
     ablation,
     curriculum,
+    few_demonstrations,
     grid_report,
     inputs,
     randomisation,
@@ -40,7 +41,11 @@ PLANS = {
 } | {
     "ablation": ablation.plan(
         SAMPLE, steps=2, dagger_rounds=1, dagger_frames=8, episodes=2
-    )
+    ),
+    "few_demonstrations": few_demonstrations.plan(
+        SAMPLE, demonstrations=[3, 5], teachers=["expert", "servo"], env_steps=120, base_steps=2,
+        imitation_steps=3, imitation_rounds=2, episodes=2, eyes="align-hard",
+    ),
 }  # fmt: skip
 DATA = Recording(task="align-thesis", episodes=3, options={"start": "mixed"})
 pytestmark = pytest.mark.timeout(600)
