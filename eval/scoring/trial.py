@@ -35,8 +35,8 @@ DECISION_LIMIT_S = 10.0
 LONGEST_DECISION_LIMIT_S = 3600.0
 # A policy in another process keeps the time itself; this much later the alarm goes off anyway (s).
 _GRACE_S = 5.0
-# A nanometre: precise enough for any comparison, and short to read.
-_DIGITS = 6
+# A micrometre: a tenth of what is allowed where an episode is played again, and short to read.
+_DIGITS = 3
 
 Decide = Callable[[Observation], Action]
 
