@@ -238,6 +238,7 @@ def partly_logged(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempP
     path = tmp_path_factory.mktemp("partly") / "result.json"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(protocol, "LOGGED_OF_BUILTIN", 2)
+        patch.setattr(protocol, "UNWATCHED", ())
         protocol.evaluate(request.param, TASK, path, episodes=4)
     return path
 
@@ -381,7 +382,9 @@ def better_error(content: Content, path: Path) -> None:
 
 
 def worse_settled_error(content: Content, path: Path) -> None:
-    content["episodes"]["settled"]["errors"]["tilt_error_deg"][1] += 0.011
+    errors = content["episodes"]["settled"]["errors"]
+    errors["tilt_error_deg"] = spread(errors["tilt_error_deg"])
+    errors["tilt_error_deg"][1] += 0.011
     reseal(content)
 
 
