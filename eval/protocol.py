@@ -32,8 +32,8 @@ from hvs_suite.tasks.shared.spec import Spec
 
 LOGGED_OF_BUILTIN = 50
 """Scenarios that the log of a built-in policy holds: it can play the others again."""
-UNWATCHED = ("random", "zero")
-"""Nobody learns from watching these policies: one scenario is logged, and no clip is drawn."""
+UNWATCHED = "random"
+"""Nobody learns anything from watching this policy: one scenario is logged, and no clip drawn."""
 
 Progress = Callable[[Trial], None]
 
@@ -179,7 +179,7 @@ class _Evaluation:
         player, spec = self.player, self.spec
         rows = [trial.row for trial in trials]
         plays_again = player.kind == "builtin" and not self.origin["options"]
-        most = 1 if player.name in UNWATCHED else LOGGED_OF_BUILTIN
+        most = 1 if player.name == UNWATCHED else LOGGED_OF_BUILTIN
         n_logged = min(most, len(rows)) if plays_again else len(rows)
         log = action_log.encode([trial.actions for trial in trials[:n_logged]])
         judged_by: dict[str, Any] = {

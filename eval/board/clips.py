@@ -129,7 +129,7 @@ def clips(
     orders = [
         _Order(entry, kind, row, _path(folder, entry, kind, row))
         for entry in submissions
-        if entry.result.summary.policy not in UNWATCHED
+        if entry.result.summary.policy != UNWATCHED
         for kind, row in choose(entry.result)
     ]
     missing = [order for order in orders if not order.path.exists()]

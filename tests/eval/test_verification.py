@@ -238,7 +238,6 @@ def partly_logged(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempP
     path = tmp_path_factory.mktemp("partly") / "result.json"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(protocol, "LOGGED_OF_BUILTIN", 2)
-        patch.setattr(protocol, "UNWATCHED", ())
         protocol.evaluate(request.param, TASK, path, episodes=4)
     return path
 
