@@ -148,13 +148,15 @@ def _imitation_rows(trained: Mapping[str, Any], outcome: Mapping[str, Any]) -> d
     demonstrator = trained.get("demonstrator", EXPERT)
     by_expert = demonstrator == EXPERT
     action = "the expert's action" if by_expert else "the demonstrator's action"
+    # Runs from before there was a choice had this one.
+    teacher = settings.get("dagger_teacher", "demonstrator")
     rounds = outcome["rounds"]
     corrected = sum(played["frames"] for played in rounds)
     return {
         "parameters": f"{outcome['n_parameters']:,}",
         "demonstrations": "of the suite's expert" if by_expert else f"of `{demonstrator}`",
         "DAgger": f"{len(rounds)} rounds, {corrected:,} frames played by the policy itself under "
-        "the expert's labels"
+        f"the labels of the {teacher}"
         if rounds
         else "none",
         "optimiser steps": f"{outcome['step']:,}, in turns of the eyes on "
