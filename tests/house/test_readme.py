@@ -69,8 +69,9 @@ def test_the_figures_are_the_board_s():
     assert {hvs_suite.TASKS[row[0]].family for row in rows} == {
         spec.family for spec in hvs_suite.TASKS.values()
     }
+    columns = ("expert", "servo", "pretrained", "finetuned")
     for task, _, *shares in rows:
-        for policy, share in zip(("expert", "servo", "pretrained"), shares, strict=True):
+        for policy, share in zip(columns, shares, strict=True):
             path = ROOT / "eval" / "results" / policy / f"{task}.json"
             if not path.exists():
                 assert share == "-"
