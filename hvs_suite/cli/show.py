@@ -63,9 +63,9 @@ class Show:
         has_one = lock.is_own(self.task) and not options
         certificate = load_certificate(self.task) if has_one else None
         is_page = self.out.suffix.lower() == ".md"
-        # A page's picture is kept with the project: in a twentieth of the bytes.
+        # A page's picture is kept with the project: in a quarter of the bytes.
         picture = self.out.with_suffix(".webp") if is_page else self.out
-        how = {"quality": 50, "method": 6} if is_page else {}
+        encoding = {"quality": 50, "method": 6} if is_page else {}
         if is_page and certificate is None:
             raise OptionError(f"{self.task} as asked for has no certificate to make a page of")
         with hvs_suite.load(self.task, split="test", **options) as env:
@@ -76,7 +76,7 @@ class Show:
                     text = page(env, certificate, picture.name)
                     temporary.write_text(text, encoding="utf-8")
         with replacing(picture) as temporary:
-            figure.savefig(temporary, dpi=DPI, facecolor="white", pil_kwargs=how)
+            figure.savefig(temporary, dpi=DPI, facecolor="white", pil_kwargs=encoding)
         if certificate is not None:
             console.print_table(
                 (title(certificate), "found", "needed", ""),
