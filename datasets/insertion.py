@@ -46,6 +46,10 @@ ASIDE_MM = 15.0
 PRESS_MM = 3.0
 """How far below the tip the set point of one that presses gently is: the arm gives 0.2 mm a newton.
 """
+SLIDE_MM = 1.5
+"""How far beside the axis one that presses gently slides over the face, without going up."""
+LED_MM = 0.3
+"""From how deep in the mouth it lets the mouth alone lead it sideways."""
 SETTLED_SHARE = 1.0 / 3.0
 """Of how far off a tip may be and still be caught: so near to the axis it goes into the hole."""
 
@@ -130,6 +134,9 @@ class GuardedInsertion:
             return self._planner.next_set_point(joints, velocity, above, onward=goal)
         off = max(sent[LATERAL], arm[LATERAL], within * arm[TILT] / SETTLED_DEG)
         least = 1000.0 * goal.standoff_m
+        if gently:
+            # The lower it is, the more it slides: going up at each small error takes all the time.
+            off -= SLIDE_MM * min(max(1.0 - arm[HEIGHT] / GATE_MM, 0.0), 1.0)
         if arm[HEIGHT] > 0.0:
             # Through the mouth within one tolerance, above the gate from two on.
             least += (GATE_MM - least) * min(max(off / within - 1.0, 0.0), 1.0)
@@ -142,8 +149,16 @@ class GuardedInsertion:
         beside = tip - goal.target
         beside -= (beside @ goal.normal) * goal.normal
         left = max(sent[LATERAL] - ASIDE_MM, 0.0) / max(sent[LATERAL], ASIDE_MM)
+        aside = left * beside
+        if gently:
+            # In the mouth, which may be elsewhere, it goes where the mouth leads it.
+            _, led = self._kinematics.tip_pose(joints)
+            led -= goal.target
+            led -= (led @ goal.normal) * goal.normal
+            share = min(max(-arm[HEIGHT] / LED_MM, 0.0), 1.0)
+            aside = aside + share * (led - aside)
         return self.straight(
-            set_point, goal.target + left * beside + 0.001 * height * goal.normal, goal
+            set_point, goal.target + aside + 0.001 * height * goal.normal, goal
         )
 
     def errors(self, q: FloatArray, goal: Goal) -> dict[str, float]:
