@@ -50,6 +50,11 @@ SLIDE_MM = 1.5
 """How far beside the axis one that presses gently slides over the face, without going up."""
 LED_MM = 0.3
 """From how deep in the mouth it lets the mouth alone lead it sideways."""
+IN_MM = 1.0
+"""From how deep on it is in the hole, where nothing is left to be pressed on but the bottom."""
+IN_STEP_MM = 3.0
+IN_PRESS_MM = 5.0
+"""Step down, and how far the set point may be below the tip, there."""
 SETTLED_SHARE = 1.0 / 3.0
 """Of how far off a tip may be and still be caught: so near to the axis it goes into the hole."""
 
@@ -141,9 +146,14 @@ class GuardedInsertion:
             # Through the mouth within one tolerance, above the gate from two on.
             least += (GATE_MM - least) * min(max(off / within - 1.0, 0.0), 1.0)
             least += min(FUNNEL_SLOPE * max(off - 2.0 * within, 0.0), ABOVE_MM - GATE_MM)
-        if gently and height < GATE_MM:
-            least = max(least, arm[HEIGHT] - PRESS_MM)
-        step = min(max(_BRAKING * (height - GATE_MM), SLOW_MM), FAST_MM)
+        slow, press = SLOW_MM, PRESS_MM
+        if gently:
+            share = min(max((-arm[HEIGHT] - LED_MM) / (IN_MM - LED_MM), 0.0), 1.0)
+            slow += share * (IN_STEP_MM - slow)
+            press += share * (IN_PRESS_MM - press)
+            if height < GATE_MM:
+                least = max(least, arm[HEIGHT] - press)
+        step = min(max(_BRAKING * (height - GATE_MM), slow), FAST_MM)
         height = max(height - step, least) if height > least else min(height + FAST_MM, least)
         _, tip = self._kinematics.tip_pose(set_point)
         beside = tip - goal.target
