@@ -6,6 +6,7 @@ before the tip enters the mouth.
 """
 
 import dataclasses
+import math
 
 import numpy as np
 import numpy.typing as npt
@@ -138,43 +139,39 @@ class GuardedInsertion:
             above = dataclasses.replace(goal, standoff_m=0.001 * ABOVE_MM)
             return self._planner.next_set_point(joints, velocity, above, onward=goal)
         off = max(sent[LATERAL], arm[LATERAL], within * arm[TILT] / SETTLED_DEG)
-        least = 1000.0 * goal.standoff_m
+        slow, press, led = SLOW_MM, math.inf, 0.0
         if gently:
             # The lower it is, the more it slides: going up at each small error takes all the time.
-            off -= SLIDE_MM * min(max(1.0 - arm[HEIGHT] / GATE_MM, 0.0), 1.0)
+            off -= SLIDE_MM * _share(1.0 - arm[HEIGHT] / GATE_MM)
+            # In the mouth, which may be elsewhere, it goes where the mouth leads it.
+            led = _share(-arm[HEIGHT] / LED_MM)
+            inside = _share((-arm[HEIGHT] - LED_MM) / (IN_MM - LED_MM))
+            slow += inside * (IN_STEP_MM - SLOW_MM)
+            press = PRESS_MM + inside * (IN_PRESS_MM - PRESS_MM)
+        least = 1000.0 * goal.standoff_m
         if arm[HEIGHT] > 0.0:
             # Through the mouth within one tolerance, above the gate from two on.
-            least += (GATE_MM - least) * min(max(off / within - 1.0, 0.0), 1.0)
+            least += (GATE_MM - least) * _share(off / within - 1.0)
             least += min(FUNNEL_SLOPE * max(off - 2.0 * within, 0.0), ABOVE_MM - GATE_MM)
-        slow, press = SLOW_MM, PRESS_MM
-        if gently:
-            share = min(max((-arm[HEIGHT] - LED_MM) / (IN_MM - LED_MM), 0.0), 1.0)
-            slow += share * (IN_STEP_MM - slow)
-            press += share * (IN_PRESS_MM - press)
-            if height < GATE_MM:
-                least = max(least, arm[HEIGHT] - press)
+        if height < GATE_MM:
+            least = max(least, arm[HEIGHT] - press)
         step = min(max(_BRAKING * (height - GATE_MM), slow), FAST_MM)
         height = max(height - step, least) if height > least else min(height + FAST_MM, least)
-        _, tip = self._kinematics.tip_pose(set_point)
-        beside = tip - goal.target
-        beside -= (beside @ goal.normal) * goal.normal
         left = max(sent[LATERAL] - ASIDE_MM, 0.0) / max(sent[LATERAL], ASIDE_MM)
-        aside = left * beside
-        if gently:
-            # In the mouth, which may be elsewhere, it goes where the mouth leads it.
-            _, led = self._kinematics.tip_pose(joints)
-            led -= goal.target
-            led -= (led @ goal.normal) * goal.normal
-            share = min(max(-arm[HEIGHT] / LED_MM, 0.0), 1.0)
-            aside = aside + share * (led - aside)
-        return self.straight(
-            set_point, goal.target + aside + 0.001 * height * goal.normal, goal
-        )
+        aside = left * self._beside(set_point, goal)
+        aside += led * (self._beside(joints, goal) - aside)
+        return self.straight(set_point, goal.target + aside + 0.001 * height * goal.normal, goal)
 
     def errors(self, q: FloatArray, goal: Goal) -> dict[str, float]:
         """Lateral error (mm), height above the mouth (mm) and tilt (deg) of the tip at q (7,)."""
         R, p = self._kinematics.tip_pose(q)
         return goal_errors(Tip(p, R[:, 2]), dataclasses.replace(goal, standoff_m=0.0))
+
+    def _beside(self, q: FloatArray, goal: Goal) -> FloatArray:
+        """From the goal's axis to the tip at q (7,), (3,) m."""
+        _, p = self._kinematics.tip_pose(q)
+        beside = p - goal.target
+        return np.asarray(beside - (beside @ goal.normal) * goal.normal)
 
     def straight(self, set_point: FloatArray, tip: FloatArray, goal: Goal) -> FloatArray:
         """The nearest set point (7,) with the tip (3,) at a place, along the goal's axis.
@@ -198,3 +195,7 @@ class GuardedInsertion:
         """A step straight up from where the set point's tip is (3,) m."""
         _, p = self._kinematics.tip_pose(set_point)
         return np.asarray(p + 0.001 * FAST_MM * goal.normal)
+
+
+def _share(x: float) -> float:
+    return min(max(x, 0.0), 1.0)

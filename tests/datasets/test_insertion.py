@@ -1,6 +1,7 @@
 """Ways into a hole: the expert's, and the one that demonstrations show."""
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 import hvs_suite
@@ -10,6 +11,7 @@ from hvs_suite.datasets.expert import Expert
 from hvs_suite.datasets.insertion import GuardedInsertion
 from hvs_suite.datasets.looking import Demonstrator
 from hvs_suite.registry import TASKS
+from hvs_suite.tasks.insert import InsertSpec
 from hvs_suite.tasks.shared.goal import UP, Goal
 
 HEIGHT_M = 0.04
@@ -78,6 +80,39 @@ def test_demonstrations_press_gently_where_the_paint_says() -> None:
             assert abs(beside[2]) < 0.0005
             assert not env.info["overload"]
             assert env.info["errors"]["peak_force_n"] > 5.0
+
+
+def sent_from(beside_m: float, height_m: float, *, gently: bool) -> npt.NDArray[np.float64]:
+    """Where the tip is sent by the goal (mm), from where it and its set point stand."""
+    spec = TASKS["insert-feel"]
+    assert isinstance(spec, InsertSpec)
+    model = kinematics(spec.embodiment)
+    insertion = GuardedInsertion(spec.control_period_s, spec.embodiment)
+    goal = Goal(np.array([0.6, 0.1, 0.05]), UP, -spec.goal_depth_m)
+    above = model.goal_configurations_at_tool_angle(goal.target + HEIGHT_M * UP, UP, 0.0)
+    posture = above[np.abs(above).max(axis=1).argmin()]
+    place = goal.target + np.array([beside_m, 0.0, height_m])
+    q = model.nearest_configuration(posture, place, UP, JOINT_ACCELERATION_RAD_S2)
+    assert q is not None
+    sent = insertion.learnable_set_point(q, np.zeros(7), q, goal, spec.caught_mm, gently=gently)
+    return np.asarray(1000.0 * (model.tip_pose(sent)[1] - goal.target))
+
+
+def test_one_that_presses_gently_slides_over_the_face_and_does_not_go_up() -> None:
+    assert sent_from(0.001, 0.0, gently=True)[2] < -1.0
+    assert sent_from(0.001, 0.0005, gently=False)[2] > 1.0
+
+
+def test_one_that_presses_gently_goes_where_the_mouth_leads_it() -> None:
+    on_face, in_mouth = (sent_from(0.0005, height, gently=True) for height in (0.0, -0.001))
+    assert abs(on_face[0]) < 0.05
+    assert abs(in_mouth[0] - 0.5) < 0.05
+
+
+def test_one_that_presses_gently_goes_faster_in_the_hole() -> None:
+    on_face, in_hole = (sent_from(0.0, height, gently=True)[2] for height in (0.0, -0.005))
+    assert on_face == pytest.approx(-1.5, abs=0.1)
+    assert in_hole == pytest.approx(-5.0 - 3.0, abs=0.1)
 
 
 def test_demonstrations_pass_higher_over_the_table_than_the_expert() -> None:
