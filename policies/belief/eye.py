@@ -5,6 +5,7 @@ Features around that place, as far as the target is large, then say the rest: by
 is off, how large the target appears, which way it faces, and how sure all of this is.
 """
 
+import dataclasses
 import math
 
 import torch
@@ -33,6 +34,24 @@ UV, LOG_DIAMETER, VISIBLE, LOG_SIGMA_UV, LOG_SIGMA_SIZE, SLOPE, LOG_SIGMA_SLOPE 
 """What a sighting (B, 9) holds: the target's centre in [-1, 1] (u right, v down), the logarithm of
 its apparent diameter in image widths, the logit that it is in view, x and y of its normal in the
 camera's optical frame, and the logarithms of the standard deviations of these."""
+
+
+MAP_WEIGHT = 0.1
+MAP_SIGMA_CELLS = 0.7
+"""What the map is taught: a hill of this standard deviation over the target."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Seen:
+    """What an eye made of images.
+
+    Attributes:
+        sighting: (B, 9).
+        scores: Logits of the target's place over cells, (B, h, w).
+    """
+
+    sighting: Tensor
+    scores: Tensor
 
 
 def strides(side: int) -> tuple[int, ...]:
@@ -113,6 +132,15 @@ class Eye(nn.Module):
         Returns:
             The sighting, (B, 9).
         """
+        return self.see(images, goal).sighting
+
+    def see(self, images: Tensor, goal: Tensor | None = None) -> Seen:
+        """Look, and say where.
+
+        Args:
+            images: As in `forward`.
+            goal: As in `forward`.
+        """
         maps = self._maps(images, goal)  # (B, h, w, channels)
         scores = self.score(maps)[..., 0]
         weights = torch.softmax(scores.flatten(1), dim=1)
@@ -128,7 +156,8 @@ class Eye(nn.Module):
         points = _points(_around(self.points(maps), *place, POINTS_SIZE))
         judged = self.judge(torch.cat([pooled, patch, points, uv, u_spread, v_spread, size], dim=1))
         # A mark that is cut by the image's border has its centre elsewhere than what is in view.
-        return torch.cat([uv + judged[:, UV], size + judged[:, LOG_DIAMETER], judged[:, 3:]], dim=1)
+        sighting = [uv + judged[:, UV], size + judged[:, LOG_DIAMETER], judged[:, 3:]]
+        return Seen(torch.cat(sighting, dim=1), scores)
 
     def attention(self, images: Tensor, goal: Tensor | None = None) -> Tensor:
         """The distribution over cells whose mean is where the target is looked for first.
@@ -140,7 +169,7 @@ class Eye(nn.Module):
         Returns:
             (B, h, w), each of which sums to 1.
         """
-        scores = self.score(self._maps(images, goal))[..., 0]
+        scores = self.see(images, goal).scores
         return torch.softmax(scores.flatten(1), dim=1).view_as(scores)
 
     def _maps(self, images: Tensor, goal: Tensor | None) -> Tensor:
@@ -202,23 +231,22 @@ def _moments(marginal: Tensor) -> tuple[Tensor, Tensor]:
     return mean, variance.clamp(min=1e-8).sqrt()
 
 
-def sighting_loss(
-    sighting: Tensor, truth: Tensor, normal: Tensor
-) -> tuple[Tensor, dict[str, Tensor]]:
+def sighting_loss(seen: Seen, truth: Tensor, normal: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
     """Loss of a camera against the projected target.
 
     Centre, size and normal are learned by Huber losses, and their doubts by the likelihood of the
-    errors that remain.
+    errors that remain. The map is learned by cross-entropy: the mean of one that hesitates between
+    two things lies between them, where there is nothing.
 
     Args:
-        sighting: (B, 9).
+        seen: What the eye made of B images.
         truth: u, v, apparent diameter in image widths, visible 0/1, (B, 4).
         normal: x and y of the target's normal in the camera's optical frame, (B, 2).
 
     Returns:
         Scalar, and what it is made of.
     """
-    visible = truth[:, 3:]
+    sighting, visible = seen.sighting, truth[:, 3:]
     inside = visible * (truth[:, :2].abs().amax(dim=1, keepdim=True) <= 1.1)
     count = inside.sum().clamp(min=1.0)
 
@@ -229,6 +257,7 @@ def sighting_loss(
     size_off = sighting[:, LOG_DIAMETER] - truth[:, 2:3].clamp(min=1e-3).log()
     slope_off = sighting[:, SLOPE] - normal
     parts = {
+        "map": MAP_WEIGHT * mean(_map_loss(seen.scores, truth[:, :2])),
         "uv": 10.0
         * mean(F.smooth_l1_loss(off, torch.zeros_like(off), beta=0.01, reduction="none")),
         "size": mean(
@@ -243,6 +272,21 @@ def sighting_loss(
         "visible": 0.3 * F.binary_cross_entropy_with_logits(sighting[:, VISIBLE], visible),
     }
     return sum(parts.values(), torch.zeros(())), parts
+
+
+def _map_loss(scores: Tensor, uv: Tensor) -> Tensor:
+    """Cross-entropy of maps (B, h, w) against a hill over a place (B, 2) in [-1, 1], (B, 1)."""
+    h, w = scores.shape[1:]
+    hill = _hill(uv[:, 1:], h)[:, :, None] * _hill(uv[:, :1], w)[:, None]
+    logs = torch.log_softmax(scores.flatten(1), dim=1)
+    return -(hill.flatten(1) * logs).sum(dim=1, keepdim=True)
+
+
+def _hill(place: Tensor, n: int) -> Tensor:
+    """A distribution over n cells around a place (B, 1) in [-1, 1], (B, n)."""
+    cells = torch.arange(n, device=place.device) + 0.5
+    off = cells - 0.5 * n * (1.0 + place)
+    return torch.softmax(-0.5 * (off / MAP_SIGMA_CELLS) ** 2, dim=1)
 
 
 def _doubt(error: Tensor, log_sigma: Tensor) -> Tensor:

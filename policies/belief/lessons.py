@@ -19,7 +19,7 @@ from hvs_suite.policies.belief.control_loss import (
     choice_loss,
     tip_loss,
 )
-from hvs_suite.policies.belief.eye import sighting_loss
+from hvs_suite.policies.belief.eye import Seen, sighting_loss
 from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
 from hvs_suite.policies.belief.recorded import Recorded
 
@@ -50,13 +50,13 @@ class Window:
 
 
 def eye_lesson(
-    network: BeliefNetwork, sightings: Mapping[str, Tensor], q: Tensor, truth: Recorded
+    network: BeliefNetwork, seen: Mapping[str, Seen], q: Tensor, truth: Recorded
 ) -> tuple[Tensor, Parts]:
     """Loss of what the eyes make of frames.
 
     Args:
         network: Knows where the cameras are.
-        sightings: Camera name to (B, 9).
+        seen: By camera name.
         q: Measured joint positions, (B, 7) rad.
         truth: Of the frames.
 
@@ -66,7 +66,7 @@ def eye_lesson(
     parts = {}
     for name, view in network.views(geometry.flange_motion(q.double())).items():
         facing = view.rotation.transpose(1, 2) @ truth.goal_normal.double()[:, :, None]
-        loss, _ = sighting_loss(sightings[name], truth.targets[name], facing[:, :2, 0].float())
+        loss, _ = sighting_loss(seen[name], truth.targets[name], facing[:, :2, 0].float())
         parts[f"{name}_loss"] = loss
     return torch.stack(list(parts.values())).sum(), parts
 

@@ -33,7 +33,7 @@ from hvs_suite.policies.belief.belief import (
     Prior,
     View,
 )
-from hvs_suite.policies.belief.eye import LOG_DIAMETER, UV, VISIBLE, Eye
+from hvs_suite.policies.belief.eye import LOG_DIAMETER, UV, VISIBLE, Eye, Seen
 from hvs_suite.policies.belief.geometry import FlangeMotion
 from hvs_suite.policies.belief.residual import RESIDUAL_SIZE, SHIFT, Residual, goal_axes
 
@@ -251,6 +251,10 @@ class BeliefNetwork(nn.Module):
     def look(self, images: Mapping[str, Tensor], goal: Tensor | None = None) -> dict[str, Tensor]:
         """Run the eyes: camera name to sightings (B, 9)."""
         return {name: eye(images[name], goal) for name, eye in self.eyes.items()}
+
+    def see(self, images: Mapping[str, Tensor], goal: Tensor | None = None) -> dict[str, Seen]:
+        """Run the eyes, and keep where they looked."""
+        return {name: eye.see(images[name], goal) for name, eye in self.eyes.items()}
 
     def set_prior(self, prior: Prior, lowest_m: float) -> None:
         """Copy what demonstrations say beforehand into the buffers that are saved with the weights.

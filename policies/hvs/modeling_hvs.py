@@ -122,14 +122,14 @@ class HvsPolicy(PreTrainedPolicy):
         }
         goal, felt = self._further(inputs)
         images = {name: inputs[IMAGES + name][counts] for name in network.shape.cameras}
-        sightings = network.look(images, None if goal is None else goal[counts])
+        seen = network.see(images, None if goal is None else goal[counts])
         eyes, of_eyes = eye_lesson(
-            network, sightings, inputs[OBS_STATE][counts][:, :N_JOINTS], truth.at(counts)
+            network, seen, inputs[OBS_STATE][counts][:, :N_JOINTS], truth.at(counts)
         )
         windows = {}
-        for name, sighting in sightings.items():
-            windows[name] = sighting.new_zeros(n, length, SIGHTING_SIZE)
-            windows[name][counts] = sighting.detach()
+        for name, each in seen.items():
+            windows[name] = each.sighting.new_zeros(n, length, SIGHTING_SIZE)
+            windows[name][counts] = each.sighting.detach()
         window = Window(
             memory=network.start(n),
             sightings=windows,

@@ -152,8 +152,8 @@ class Teacher:
         # Frames of a batch are no episodes: where the arm was sent is not asked here.
         columns[EPISODE] = np.arange(len(rows))
         truth = recorded(columns, tuple(network.shape.cameras), network.cell.period_s)
-        sightings = network.look(*self._windows.pictures(network, batch))
-        return eye_lesson(network, sightings, batch[STATE][:, :N_JOINTS], truth)
+        seen = network.see(*self._windows.pictures(network, batch))
+        return eye_lesson(network, seen, batch[STATE][:, :N_JOINTS], truth)
 
     def held_out(self) -> Parts:
         """Mean losses of the eyes on frames spread over the held-out episodes; empty without any.
