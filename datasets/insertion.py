@@ -124,7 +124,8 @@ class GuardedInsertion:
             set_point: Now, (7,) rad.
             goal: In the hole: its target is the middle of the mouth, its standoff negative.
             caught_mm: How far beside the axis the mouth still catches the tip.
-            gently: Whether the hole may be elsewhere, so that the tip must not press hard.
+            gently: Whether the hole may be elsewhere: then the tip must not press hard, slides over
+                the face, and goes where the mouth leads it.
 
         Returns:
             (7,) rad.

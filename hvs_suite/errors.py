@@ -45,6 +45,10 @@ class PolicyError(HvsError, ValueError):
     """A policy that does not exist, cannot be loaded, or does not fit the task."""
 
 
+class TrainingError(PolicyError):
+    """A training whose loss or gradient is no number any more."""
+
+
 class ResultError(HvsError, ValueError):
     """An evaluation result that is malformed, duplicate or inconsistent."""
 

@@ -427,7 +427,7 @@ class Maker:
         run = way.folder(self.out, seed)
         train_once(name, run, lambda policy, note: way.train(self.out, seed, policy, note), report)
 
-    def _cell(self, cell: Cell, seed: int, report: Report) -> Finished:
+    def _cell(self, cell: Cell, seed: int, report: Report) -> Finished | None:
         run = cell.way.folder(self.out, seed)
         results = train_and_judge(
             f"{cell.group}, {cell.name}, seed {seed}",

@@ -11,6 +11,7 @@ RL takes 16 minutes a trial with 16,000 environment steps (docs/experiments/firs
 trials 11 hours on one core, 5.5 on two.
 """
 
+import contextlib
 import dataclasses
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -19,8 +20,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import pydantic
 
-from hvs_suite.errors import OptionError, OutputError
-from hvs_suite.eval.studies.grid import Cell, Maker, make_all
+from hvs_suite.errors import OptionError, OutputError, TrainingError
+from hvs_suite.eval.studies.grid import Cell, Finished, Maker, make_all
 from hvs_suite.eval.studies.training import Report, Scenes
 from hvs_suite.eval.studies.ways import FEW, TRIAL, Effort, Way, imitation, tuned
 from hvs_suite.executor import Workers, check_workers, size
@@ -84,7 +85,7 @@ class Tried(pydantic.BaseModel):
         number: In the order of the proposals, from 0.
         settings: What was proposed.
         n: Scenes of split ``dev``.
-        n_success: Solved.
+        n_success: Solved; 0 where the training came apart.
         commands: What makes and judges the same policy, line by line.
     """
 
@@ -149,7 +150,7 @@ def run_search(
             raise OptionError(f"{name} must be at least 1, not {number}")
     out.mkdir(parents=True, exist_ok=True)
     study = _study(out / JOURNAL, learner, quick, episodes)
-    make = Maker(out, out.resolve(), episodes)
+    make = _Trials(out, out.resolve(), episodes)
 
     def found() -> Search:
         done = [each for each in study.trials if each.value is not None]
@@ -190,11 +191,20 @@ def run_search(
             kept[each.name] = each
         for number, cell in zip(settings, cells, strict=True):
             finished = kept[cell.name]
-            assert finished is not None
-            solved = finished.judged[0].solved
+            # Not as a failure, from which the sampler would learn nothing.
+            solved = finished.judged[0].solved if finished is not None else "0"
             study.tell(number, solved.count("1") / len(solved))
         if on_finished is not None:
             on_finished(found())
+
+
+class _Trials(Maker):
+    """Makes trials; of one whose training comes apart, nothing."""
+
+    def _cell(self, cell: Cell, seed: int, report: Report) -> Finished | None:
+        with contextlib.suppress(TrainingError):
+            return super()._cell(cell, seed, report)
+        return None
 
 
 def _study(journal: Path, learner: Learner, quick: bool, episodes: int) -> "optuna.Study":

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from hvs_suite.errors import PolicyError
+from hvs_suite.errors import TrainingError
 from hvs_suite.executor import Workers, check_workers
 from hvs_suite.files import replacing
 from hvs_suite.policies.imitation.dagger import (
@@ -137,7 +137,8 @@ def pretrain(
         OptionError: No budget, or a number that makes no sense.
         OutputError: ``out`` cannot be written, its disk is full, or it holds something else than
             this run. With room again, the same command goes on from the last checkpoint.
-        PolicyError: The eyes do not fit, or the loss is no longer a number.
+        PolicyError: The eyes do not fit.
+        TrainingError: The loss is no longer a number.
     """
     budget = Budget(steps, minutes)
     check_workers(workers)
@@ -269,9 +270,10 @@ class _Run:
                     started, last_checkpoint = started + pause, time.perf_counter()
                     self._play_s += pause
                 step = self._counters.step
-                if teacher.is_due(share):
+                teacher.advance(share)
+                if teacher.is_due:
                     self._checkpoint(teacher, optimizer, state, curves)
-                    teacher.look_again(share)
+                    teacher.look_again()
                 step_rate = rate * _schedule(share)
                 for group in optimizer.param_groups:
                     group["lr"] = step_rate
@@ -311,7 +313,7 @@ class _Run:
             The loss, and what it is made of.
 
         Raises:
-            PolicyError: It is no number any more.
+            TrainingError: It is no number any more.
         """
         step = self._counters.step
         loss, parts = teacher.lesson(rows, step)
@@ -324,7 +326,7 @@ class _Run:
         norm = torch.stack(norms).norm()
         # Before the step: a weight that is no number would spread through all the others.
         if not math.isfinite(loss.item()) or not math.isfinite(norm.item()):
-            raise PolicyError(
+            raise TrainingError(
                 f"training came apart at step {step + 1} (loss {loss.item()}, gradient "
                 f"{norm.item()}); {self._out} keeps its last checkpoint; train anew on other data, "
                 "or with a lower learning rate"

@@ -70,7 +70,7 @@ class Teacher:
         """Part of the training in which the eyes looked at all frames last."""
         self._due = 0.0
         self._opened = False
-        self._eyes_learn = True
+        self._share, self._at, self._eyes_learn = 0.0, 0, True
 
     def clipped_apart(self) -> list[list[nn.Parameter]]:
         """The eyes, and the rest: they learn in turns."""
@@ -78,12 +78,23 @@ class Teacher:
         known = {id(parameter) for parameter in eyes}
         return [eyes, [p for p in self.policy.parameters() if id(p) not in known]]
 
-    def is_due(self, share: float) -> bool:
-        """Whether eyes or belief are to go through everything again."""
+    def advance(self, share: float) -> None:
+        """Say how far the training is; at first, take up what a killed run saw last.
+
+        Args:
+            share: Of the training that is done, 0 to 1.
+        """
         if not self._opened:
             self._reopen(share)
-        part, self._eyes_learn = self._part(share)
-        return not self._eyes_learn and (part > self._looked_in or share >= self._due)
+        self._share = share
+        self._at, self._eyes_learn = self._part(share)
+
+    @property
+    def is_due(self) -> bool:
+        """Whether eyes or belief are to go through everything again."""
+        if self._eyes_learn:
+            return False
+        return self._at > self._looked_in or self._share >= self._due
 
     def _part(self, share: float) -> tuple[int, bool]:
         """Which part of the training this is, and whether it is the eyes' turn."""
@@ -98,20 +109,20 @@ class Teacher:
         if kept is not None:
             self._looked_in, self._due = self._part(kept)[0], _next_due(kept)
 
-    def look_again(self, share: float) -> None:
+    def look_again(self) -> None:
         """Look at all frames once in each part of the training; recall all episodes.
 
         This takes too long for every step; the result is a function of the weights.
         """
-        network, (part, _) = self.policy.network, self._part(share)
+        network = self.policy.network
         self.policy.eval()
-        if part > self._looked_in:
+        if self._at > self._looked_in:
             self._windows.look(network)
         else:
             self._windows.recall(network)
         self.policy.train()
-        self._windows.keep(self._file, share)
-        self._looked_in, self._due = part, _next_due(share)
+        self._windows.keep(self._file, self._share)
+        self._looked_in, self._due = self._at, _next_due(self._share)
 
     def lesson(self, rows: Rows, step: int) -> tuple[Tensor, Parts]:
         """Loss to learn from, and what it is made of.

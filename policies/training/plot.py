@@ -37,6 +37,7 @@ def draw_run(out: Path) -> Path:
         OutputError: It cannot be written.
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     curves = read_curves(out / "training" / "tensorboard")
     rounds = _rounds(out / "training" / "dagger")
@@ -51,6 +52,8 @@ def draw_run(out: Path) -> Path:
     rest.set_title("losses of belief and head, in their turns")
     # Likelihoods fall below zero; what lies near it is drawn to scale.
     eyes.set_yscale("symlog")
+    # Between two powers of ten there would be no figure.
+    eyes.yaxis.set_major_locator(MaxNLocator(6))
     eyes.yaxis.set_major_formatter("{x:g}")
     for axes in (eyes, rest):
         axes.set(xlabel="optimiser step")

@@ -17,34 +17,39 @@ from hvs_suite.tasks.shared.goal import UP, Goal
 HEIGHT_M = 0.04
 
 
-def next_heights(caught_mm: float | None) -> list[float]:
-    """Heights (mm) that the tip is sent to from 40 mm, 0.4 and 0.6 mm beside the axis."""
-    spec = TASKS["insert-wide"]
+def sent_from(task: str, beside_m: float, height_m: float, way: str) -> npt.NDArray[np.float64]:
+    """Where the tip is sent by the goal (mm), from where it and its set point stand."""
+    spec = TASKS[task]
+    assert isinstance(spec, InsertSpec)
     model = kinematics(spec.embodiment)
     insertion = GuardedInsertion(spec.control_period_s, spec.embodiment)
-    goal = Goal(np.array([0.6, 0.1, 0.05]), UP, -0.013)
+    goal = Goal(np.array([0.6, 0.1, 0.05]), UP, -spec.goal_depth_m)
     above = model.goal_configurations_at_tool_angle(goal.target + HEIGHT_M * UP, UP, 0.0)
     posture = above[np.abs(above).max(axis=1).argmin()]
-    heights = []
-    for beside_m in (0.0004, 0.0006):
-        place = goal.target + np.array([beside_m, 0.0, HEIGHT_M])
-        q = model.nearest_configuration(posture, place, UP, JOINT_ACCELERATION_RAD_S2)
-        assert q is not None
-        still = np.zeros(7)
-        sent = (
-            insertion.next_set_point(q, still, q, goal)
-            if caught_mm is None
-            else insertion.learnable_set_point(q, still, q, goal, caught_mm)
+    place = goal.target + np.array([beside_m, 0.0, height_m])
+    q = model.nearest_configuration(posture, place, UP, JOINT_ACCELERATION_RAD_S2)
+    assert q is not None
+    still = np.zeros(7)
+    sent = (
+        insertion.next_set_point(q, still, q, goal)
+        if way == "expert"
+        else insertion.learnable_set_point(
+            q, still, q, goal, spec.caught_mm, gently=way == "gentle"
         )
-        heights.append(1000.0 * (model.tip_pose(sent)[1] - goal.target)[2])
-    return heights
+    )
+    return np.asarray(1000.0 * (model.tip_pose(sent)[1] - goal.target))
+
+
+def next_heights(way: str) -> list[float]:
+    """Heights (mm) that the tip is sent to, 0.4 and 0.6 mm beside the axis."""
+    return [sent_from("insert-wide", beside, HEIGHT_M, way)[2] for beside in (0.0004, 0.0006)]
 
 
 def test_a_way_that_can_be_learned_does_not_turn_back_at_half_a_millimetre() -> None:
-    left, right = next_heights(1.5)
+    left, right = next_heights("learnable")
     assert abs(left - right) < 1.0
     assert max(left, right) < 1000.0 * HEIGHT_M - 5.0
-    left, right = next_heights(None)
+    left, right = next_heights("expert")
     assert right - left > 5.0
 
 
@@ -82,35 +87,23 @@ def test_demonstrations_press_gently_where_the_paint_says() -> None:
             assert env.info["errors"]["peak_force_n"] > 5.0
 
 
-def sent_from(beside_m: float, height_m: float, *, gently: bool) -> npt.NDArray[np.float64]:
-    """Where the tip is sent by the goal (mm), from where it and its set point stand."""
-    spec = TASKS["insert-feel"]
-    assert isinstance(spec, InsertSpec)
-    model = kinematics(spec.embodiment)
-    insertion = GuardedInsertion(spec.control_period_s, spec.embodiment)
-    goal = Goal(np.array([0.6, 0.1, 0.05]), UP, -spec.goal_depth_m)
-    above = model.goal_configurations_at_tool_angle(goal.target + HEIGHT_M * UP, UP, 0.0)
-    posture = above[np.abs(above).max(axis=1).argmin()]
-    place = goal.target + np.array([beside_m, 0.0, height_m])
-    q = model.nearest_configuration(posture, place, UP, JOINT_ACCELERATION_RAD_S2)
-    assert q is not None
-    sent = insertion.learnable_set_point(q, np.zeros(7), q, goal, spec.caught_mm, gently=gently)
-    return np.asarray(1000.0 * (model.tip_pose(sent)[1] - goal.target))
-
-
 def test_one_that_presses_gently_slides_over_the_face_and_does_not_go_up() -> None:
-    assert sent_from(0.001, 0.0, gently=True)[2] < -1.0
-    assert sent_from(0.001, 0.0005, gently=False)[2] > 1.0
+    assert sent_from("insert-feel", 0.001, 0.0, "gentle")[2] < -1.0
+    assert sent_from("insert-feel", 0.001, 0.0005, "learnable")[2] > 1.0
 
 
 def test_one_that_presses_gently_goes_where_the_mouth_leads_it() -> None:
-    on_face, in_mouth = (sent_from(0.0005, height, gently=True) for height in (0.0, -0.001))
+    on_face, in_mouth = (
+        sent_from("insert-feel", 0.0005, height, "gentle") for height in (0.0, -0.001)
+    )
     assert abs(on_face[0]) < 0.05
     assert abs(in_mouth[0] - 0.5) < 0.05
 
 
 def test_one_that_presses_gently_goes_faster_in_the_hole() -> None:
-    on_face, in_hole = (sent_from(0.0, height, gently=True)[2] for height in (0.0, -0.005))
+    on_face, in_hole = (
+        sent_from("insert-feel", 0.0, height, "gentle")[2] for height in (0.0, -0.005)
+    )
     assert on_face == pytest.approx(-1.5, abs=0.1)
     assert in_hole == pytest.approx(-5.0 - 3.0, abs=0.1)
 

@@ -5,9 +5,10 @@ import math
 import pytest
 
 from hvs_suite.cli.main import run
-from hvs_suite.errors import OptionError, OutputError
+from hvs_suite.errors import OptionError, OutputError, TrainingError
 from hvs_suite.eval.studies import search, search_report
 from hvs_suite.eval.studies.grid import Finished, Judged
+from hvs_suite.eval.studies.ways import Imitation, Recording
 
 SCENES = 200
 
@@ -81,6 +82,17 @@ def test_a_trial_is_made_with_what_was_proposed(tmp_path, monkeypatch):
     [line] = [line for line in trial.commands if line.startswith("hvs pretrain")]
     for name, value in trial.settings.items():
         assert f"--{name.replace('_', '-')} {value}" in line
+
+
+def test_a_trial_that_comes_apart_solves_nothing_and_the_search_goes_on(tmp_path, monkeypatch):
+    def come_apart(*words: object) -> None:
+        raise TrainingError("training came apart")
+
+    monkeypatch.setattr(Recording, "make", silent)
+    monkeypatch.setattr(Imitation, "train", come_apart)
+    found = search.run_search("imitation", tmp_path, silent, trials=2, workers=1)
+    assert [trial.n_success for trial in found.trials] == [0, 0]
+    assert found.trials[0].settings != found.trials[1].settings
 
 
 def test_nonsense_is_refused(tmp_path, capsys):

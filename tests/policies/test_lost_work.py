@@ -14,7 +14,7 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from hvs_suite.cli import main
-from hvs_suite.errors import OutputError, PolicyError
+from hvs_suite.errors import OutputError, TrainingError
 from hvs_suite.policies.imitation.frame_cache import cached_frames, new_frames
 from hvs_suite.policies.imitation.pretrain import pretrain
 from hvs_suite.policies.imitation.state import Counters, load_state, save_state
@@ -187,7 +187,7 @@ def test_a_run_that_comes_apart_keeps_its_last_good_weights(dataset, tmp_path, m
         return loss * np.nan if where == "loss" else (lead - lead.detach()).sqrt(), parts
 
     monkeypatch.setattr(Teacher, "lesson", unsound)
-    with pytest.raises(PolicyError, match="came apart at step 3"):
+    with pytest.raises(TrainingError, match="came apart at step 3"):
         pretrain(dataset, out, **RUN)
     for name in ("model.safetensors", "training/state.safetensors"):
         assert (out / name).read_bytes() == (tmp_path / "before" / name).read_bytes()

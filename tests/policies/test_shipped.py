@@ -36,12 +36,12 @@ def test_shipped_weights_solve_scenes_that_nobody_trained_on(kind, task):
     make = catalogue.policy_factory(kind, task)
     episodes = rollout(Load(task), make, range(5))
     summary = result_file.load(RESULTS / kind / f"{task}.json").summary
-    # Fewer than this happens once in fifty times to weights that are as good as the board says.
+    # Fewer solved than this, or more collisions, happens once in fifty times to weights that are as
+    # good as the board says.
     usual = scipy.stats.binom.ppf(0.02, 5, summary.n_success / summary.n_episodes)
     assert sum(episode.success for episode in episodes) >= min(4, usual)
-    # Amid disturbances a few are lost that way: the board says how many.
-    if hvs_suite.TASKS[task].eth_position_noise_m == 0.0:
-        assert not any(episode.collision for episode in episodes)
+    most = scipy.stats.binom.ppf(0.98, 5, summary.n_collision / summary.n_episodes)
+    assert sum(episode.collision for episode in episodes) <= most
 
 
 @pytest.mark.parametrize(("kind", "task"), SHIPPED)
