@@ -2,10 +2,10 @@
 
 What leans towards a camera looks larger: of a ring of marks around the target, the near half lies
 farther out than the far half, by a hundredth of the ring. Convolutions did not learn to see this
-in thousands of steps (docs/experiments/belief.md). Image moments, which visual servoing has used for
-long (Chaumette 2004, "Image moments: a general and useful set of features for visual servoing",
-IEEE Transactions on Robotics 20(4), 713-723), hold it in numbers of which a small network learns
-it soon.
+in thousands of steps (docs/experiments/belief.md). Image moments, which visual servoing has used
+for long (Chaumette 2004, "Image moments: a general and useful set of features for visual
+servoing", IEEE Transactions on Robotics 20(4), 713-723), hold it in numbers from which a small
+network learns it soon.
 
 Colour contrasts are weighed by Gaussian windows about the target, some multiples of its size, and
 their moments to the third order divided by their sum. What varies little among these numbers says
