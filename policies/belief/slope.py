@@ -25,7 +25,10 @@ OPPONENTS = (
     (0.33, 0.33, 0.33),
     (-0.33, -0.33, -0.33),
 )
-"""Contrasts of red, green and blue that it begins with: opponent colours, and light and dark."""
+"""Contrasts of red, green and blue: opponent colours, light and dark. Learned ones drift, and the
+scales of their moments lag behind them."""
+BRIGHTNESS = ((1.0,), (-1.0,))
+"""The same of grey."""
 WINDOWS = (0.5, 1.0, 1.6)
 """Standard deviations of the windows, in diameters of the target."""
 ORDER = 3
@@ -36,6 +39,8 @@ MOST_PX = 112
 LEAST = 1e-3
 """Sums below it count as none (areas of the target's diameter squared)."""
 LEAST_DIAMETER = 0.005
+LEAST_SPREAD = 0.003
+"""What varies less is not raised to the others' scale."""
 RECENT = 100
 """Batches over which means and spreads are averaged, about."""
 
@@ -49,18 +54,16 @@ class SlopeEye(nn.Module):
         hidden: Width of the first layer.
     """
 
+    contrasts: Tensor
     mean: Tensor
     variance: Tensor
     n_batches: Tensor
 
     def __init__(self, in_channels: int, side: int, hidden: int = 128) -> None:
         super().__init__()
-        self.contrasts = nn.Linear(in_channels, len(OPPONENTS))
-        if in_channels == len(OPPONENTS[0]):
-            with torch.no_grad():
-                self.contrasts.weight.copy_(torch.tensor(OPPONENTS))
-                self.contrasts.bias.zero_()
-        n = len(OPPONENTS) * len(WINDOWS) * (1 + len(PARTS))
+        contrasts = OPPONENTS if in_channels == len(OPPONENTS[0]) else BRIGHTNESS
+        self.register_buffer("contrasts", torch.tensor(contrasts), persistent=False)
+        n = len(contrasts) * len(WINDOWS) * (1 + len(PARTS))
         self.register_buffer("mean", torch.zeros(n))
         self.register_buffer("variance", torch.ones(n))
         self.register_buffer("n_batches", torch.tensor(0.0))
@@ -92,7 +95,7 @@ class SlopeEye(nn.Module):
         numbers = self._moments(images, uv, diameter)
         if self.training:
             self._take_in(numbers.detach(), counts)
-        alike = (numbers - self.mean) * torch.rsqrt(self.variance + 1e-10)
+        alike = (numbers - self.mean) * torch.rsqrt(self.variance + LEAST_SPREAD**2)
         # A target that is cut or not there gives numbers that no other has.
         alike = alike.clamp(-10.0, 10.0)
         return self.judge(torch.cat([alike, uv, diameter.log() + 2.0], dim=1))
@@ -118,8 +121,7 @@ class SlopeEye(nn.Module):
             bases.append(torch.exp(-0.5 * scaled**2) * powers)  # (B, 2, window, order + 1)
         along_u, along_v = torch.cat(bases, dim=3).unbind(dim=1)
         # Four times as fast as a convolution of one pixel.
-        seen = self.contrasts.weight @ images.flatten(2) + self.contrasts.bias[:, None]
-        seen = torch.relu(seen).view(n, -1, window)
+        seen = torch.relu(self.contrasts @ images.flatten(2)).view(n, -1, window)
         rows_summed = seen @ along_u  # (B, c * window, k)
         rows_summed = rows_summed.view(n, -1, window, len(WINDOWS), ORDER + 1)
         along_v = along_v.view(n, window, len(WINDOWS), ORDER + 1)

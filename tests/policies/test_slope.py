@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hvs_suite.policies.belief.slope import MOST_PX, OPPONENTS, SlopeEye
+from hvs_suite.policies.belief.slope import MOST_PX, SlopeEye
 
 DIAMETER = 0.2
 
@@ -108,4 +108,3 @@ def test_grey_images_have_contrasts_too() -> None:
     eye = SlopeEye(1, 56)
     uv, size, counts = place(torch.zeros(2, 2))
     assert eye(torch.rand(2, 1, 56, 56) - 0.5, uv, size, counts).shape == (2, 3)
-    assert eye.contrasts.out_features == len(OPPONENTS)
