@@ -257,7 +257,8 @@ class BeliefNetwork(nn.Module):
 
     def see(self, images: Mapping[str, Tensor], goal: Tensor | None = None) -> dict[str, Seen]:
         """Run the eyes, and keep where they looked."""
-        return {name: eye.see(images[name], goal) for name, eye in self.eyes.items()}
+        eyes = {name: eye for name, eye in self.eyes.items() if isinstance(eye, Eye)}
+        return {name: eye.see(images[name], goal) for name, eye in eyes.items()}
 
     def set_prior(self, prior: Prior, lowest_m: float) -> None:
         """Copy what demonstrations say beforehand into the buffers that are saved with the weights.
