@@ -45,6 +45,8 @@ class Pretrain(Players):
             find: a checkpoint folder, or a named task for the weights shipped for it.
         windows: Windows of control steps that belief and head learn from in a step.
         window_steps: Length of each.
+        slopes: Cameras whose eyes tell the slope of the surface by image moments, joined by +; for
+            surfaces that lean.
         batch_size: Frames that the eyes learn from in a step.
         learning_rate: Peak of the schedule.
         seed: Seed of the initial weights, the held-out episodes and the order.
@@ -64,6 +66,7 @@ class Pretrain(Players):
     eyes: str | None = None
     windows: int = 48
     window_steps: int = 16
+    slopes: str | None = None
     batch_size: int = 64
     learning_rate: float = 2e-3
     seed: int = 0
@@ -91,6 +94,7 @@ class Pretrain(Players):
                 eyes=None if self.eyes is None else _folder(self.eyes),
                 windows=self.windows,
                 window_steps=self.window_steps,
+                slopes=() if self.slopes is None else tuple(self.slopes.split("+")),
                 batch_size=self.batch_size,
                 learning_rate=self.learning_rate,
                 workers=self.players(local=2),

@@ -12,6 +12,8 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
+from hvs_suite.policies.belief.slope import SlopeEye
+
 FEATURE_SIZE = 28
 """Cells along the side of a feature map, about."""
 PATCH_SIZE = 8
@@ -80,6 +82,7 @@ class Eye(nn.Module):
         side: Side of the image (px).
         channels: Channels of the features.
         n_goals: Length of the one-hot vector that says which target is meant; 0 for none.
+        slopes: Tell slopes by image moments.
 
     Attributes:
         channels: Channels of the features.
@@ -89,7 +92,9 @@ class Eye(nn.Module):
 
     train_in_bfloat16 = False
 
-    def __init__(self, in_channels: int, side: int, channels: int, n_goals: int = 0) -> None:
+    def __init__(
+        self, in_channels: int, side: int, channels: int, n_goals: int = 0, *, slopes: bool = False
+    ) -> None:
         super().__init__()
         self.channels = channels
         layers: list[nn.Module] = []
@@ -121,6 +126,7 @@ class Eye(nn.Module):
         self.points = nn.Linear(channels, N_POINTS)
         n_around = PATCH_CHANNELS * PATCH_SIZE**2 + 4 * N_POINTS
         self.judge = nn.Sequential(nn.Linear(2 * channels + n_around + 5, 128), nn.SiLU(), last)
+        self.slope = SlopeEye(in_channels, side) if slopes else None
 
     def forward(self, images: Tensor, goal: Tensor | None = None) -> Tensor:
         """Look.
@@ -156,8 +162,13 @@ class Eye(nn.Module):
         points = _points(_around(self.points(maps), *place, POINTS_SIZE))
         judged = self.judge(torch.cat([pooled, patch, points, uv, u_spread, v_spread, size], dim=1))
         # A mark that is cut by the image's border has its centre elsewhere than what is in view.
-        sighting = [uv + judged[:, UV], size + judged[:, LOG_DIAMETER], judged[:, 3:]]
-        return Seen(torch.cat(sighting, dim=1), scores)
+        uv, size = uv + judged[:, UV], size + judged[:, LOG_DIAMETER]
+        facing = judged[:, SLOPE.start :]
+        if self.slope is not None:
+            bright = images.float() / 255.0 if images.dtype == torch.uint8 else images
+            counts = (judged[:, VISIBLE] > 0.0) & (uv.abs().amax(dim=1, keepdim=True) < 1.0)
+            facing = self.slope(bright - 0.5, uv.detach(), size.detach(), counts)
+        return Seen(torch.cat([uv, size, judged[:, 3 : SLOPE.start], facing], dim=1), scores)
 
     def attention(self, images: Tensor, goal: Tensor | None = None) -> Tensor:
         """The distribution over cells whose mean is where the target is looked for first.

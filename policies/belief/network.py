@@ -100,6 +100,8 @@ class Shape:
         reads_positions: Whether measured joint positions are read; without them the network knows
             where the arm starts, and from there on where it has sent it.
         reads_velocities: Whether measured joint velocities are read; without them they count as 0.
+        slopes: Cameras whose eyes tell slopes by image moments, see
+            `hvs_suite.policies.belief.slope`.
     """
 
     cameras: Mapping[str, tuple[int, int]]
@@ -113,6 +115,7 @@ class Shape:
     residual_reach_m: float = 0.02
     reads_positions: bool = True
     reads_velocities: bool = True
+    slopes: tuple[str, ...] = ()
 
 
 MEMORY_SIZE = BELIEF_SIZE + 2 * N_JOINTS + 1 + RECENT_SIZE
@@ -169,7 +172,7 @@ class BeliefNetwork(nn.Module):
         cameras = tuple(shape.cameras)
         self.eyes = nn.ModuleDict(
             {
-                n: Eye(c, side, shape.channels, shape.n_goals)
+                n: Eye(c, side, shape.channels, shape.n_goals, slopes=n in shape.slopes)
                 for n, (c, side) in shape.cameras.items()
             }
         )
@@ -254,7 +257,8 @@ class BeliefNetwork(nn.Module):
 
     def see(self, images: Mapping[str, Tensor], goal: Tensor | None = None) -> dict[str, Seen]:
         """Run the eyes, and keep where they looked."""
-        return {name: eye.see(images[name], goal) for name, eye in self.eyes.items()}
+        eyes = {name: eye for name, eye in self.eyes.items() if isinstance(eye, Eye)}
+        return {name: eye.see(images[name], goal) for name, eye in eyes.items()}
 
     def set_prior(self, prior: Prior, lowest_m: float) -> None:
         """Copy what demonstrations say beforehand into the buffers that are saved with the weights.

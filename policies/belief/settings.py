@@ -6,7 +6,7 @@ checked here.
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pydantic
@@ -89,6 +89,7 @@ class Settings(pydantic.BaseModel):
         residual_reach_m: See `Shape`.
         reads_positions: See `Shape`.
         reads_velocities: See `Shape`.
+        slopes: See `Shape`.
     """
 
     model_config = pydantic.ConfigDict(extra="ignore")
@@ -108,6 +109,7 @@ class Settings(pydantic.BaseModel):
     )
     reads_positions: Annotated[bool, pydantic.Field(strict=True)] = True
     reads_velocities: Annotated[bool, pydantic.Field(strict=True)] = True
+    slopes: tuple[Literal["eih", "eth"], ...] = ()
 
     @pydantic.model_validator(mode="after")
     def _fit(self) -> "Settings":
@@ -160,6 +162,7 @@ class Settings(pydantic.BaseModel):
             residual_reach_m=self.residual_reach_m,
             reads_positions=self.reads_positions,
             reads_velocities=self.reads_velocities,
+            slopes=self.slopes,
         )
 
     def network(self) -> BeliefNetwork:

@@ -40,6 +40,7 @@ class HvsConfig(PreTrainedConfig):
         residual_reach_m: How far from the believed goal it does (m).
         reads_positions: Whether it reads measured joint positions, see `Shape`.
         reads_velocities: Whether it reads measured joint velocities.
+        slopes: Cameras whose eyes tell slopes by image moments, see `Shape`.
         family: Family of the tasks that it was trained for.
         control_period_s: Length of their control step (s).
         options: Options of the task that it was trained with, where they differ from the named one;
@@ -68,6 +69,7 @@ class HvsConfig(PreTrainedConfig):
     residual_reach_m: float = Shape.residual_reach_m
     reads_positions: bool = True
     reads_velocities: bool = True
+    slopes: tuple[str, ...] = ()
     family: str = FAMILY
     control_period_s: float = CONTROL_PERIOD_S
     options: dict[str, Any] = field(default_factory=dict)

@@ -50,6 +50,7 @@ class Settings:
         eyes: SHA-256 of the weights whose eyes it begins with; None for fresh ones.
         windows: Windows of control steps a step that belief and head learn from.
         window_steps: Length of each.
+        slopes: Cameras whose eyes tell the slope of the surface by image moments.
     """
 
     seed: int = 0
@@ -67,6 +68,7 @@ class Settings:
     eyes: str | None = None
     windows: int = 48
     window_steps: int = 16
+    slopes: tuple[str, ...] = ()
 
     def reads(self, name: str) -> bool:
         """Whether the policy is given an input."""
@@ -83,6 +85,10 @@ class Settings:
         """
         if unknown := sorted({*(self.inputs or ())} - {*INPUTS}):
             raise OptionError(f"unknown input {unknown[0]!r}; choose from {', '.join(INPUTS)}")
+        if unknown := sorted({*self.slopes} - {*manifest.cameras}):
+            raise OptionError(
+                f"unknown camera {unknown[0]!r}; choose from {', '.join(manifest.cameras)}"
+            )
         for name in ("batch_size", "dagger_frames", "windows", "window_steps"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}")
@@ -165,6 +171,7 @@ def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":
         window=settings.window_steps,
         reads_positions=settings.reads("joint_positions"),
         reads_velocities=settings.reads("joint_velocities"),
+        slopes=settings.slopes,
         **trained_for(task).model_dump(),
     )
     # torch initialises weights from its global generator; leave that as it was found.

@@ -8,10 +8,13 @@ from pathlib import Path
 import miniature
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from safetensors.torch import load_file
 
 from hvs_suite.errors import DatasetError, OptionError, OutputError, PolicyError
+from hvs_suite.policies.belief.acting import CompiledBelief, act
+from hvs_suite.policies.checkpoints.loading import load_network
 from hvs_suite.policies.imitation.demonstrations import Demonstrations
 from hvs_suite.policies.imitation.pretrain import pretrain
 from hvs_suite.policies.training.dataset import read_manifest
@@ -162,6 +165,22 @@ def test_a_policy_may_see_grey_where_the_dataset_has_colour(dataset, tmp_path):
         pretrain(dataset, tmp_path / "other", grey=("top",), **STEP)
     with pytest.raises(OptionError, match="unknown input 'top'"):
         pretrain(dataset, tmp_path / "other", inputs=("top",), **STEP)
+
+
+def test_eyes_of_chosen_cameras_tell_slopes_by_moments(dataset, tmp_path):
+    pretrain(dataset, tmp_path / "out", slopes=("eih",), **STEP)
+    assert json.loads((tmp_path / "out/config.json").read_text())["slopes"] == ["eih"]
+    moments = [name for name in weights(tmp_path / "out") if name.endswith(".slope.mean")]
+    assert len(moments) == 1
+    assert ".eih." in moments[0]
+    network = load_network(tmp_path / "out")
+    image = torch.rand(1, 3, 28, 28, generator=torch.Generator().manual_seed(0))
+    compiled = CompiledBelief(network)
+    images, state = {"eih": image, "eth": image}, torch.zeros(1, 14)
+    slow, _ = act(network, images, state, network.start(1))
+    torch.testing.assert_close(compiled(images, state, None)[0], slow, atol=1e-6, rtol=0)
+    with pytest.raises(OptionError, match="unknown camera 'top'"):
+        pretrain(dataset, tmp_path / "other", slopes=("top",), **STEP)
 
 
 def test_errors_weigh_by_the_tolerance_unless_told_otherwise(dataset, tmp_path):
