@@ -39,6 +39,7 @@ MOST_PX = 112
 LEAST = 1e-3
 """Sums below it count as none (areas of the target's diameter squared)."""
 LEAST_DIAMETER = 0.005
+"""Smaller targets count as this large (image widths)."""
 LEAST_SPREAD = 0.003
 """What varies less is not raised to the others' scale."""
 RECENT = 100
