@@ -34,6 +34,8 @@ WINDOWS = (0.5, 1.0, 1.6)
 ORDER = 3
 PARTS = tuple((a, b) for a in range(ORDER + 1) for b in range(ORDER + 1 - a) if a + b)
 SLOPE_SIZE = 3
+HIDDEN = 128
+"""Width of the first layer; the second has half of it."""
 MOST_PX = 112
 """Of an image, only a square of this side around the target is looked at."""
 LEAST = 1e-3
@@ -52,7 +54,6 @@ class SlopeEye(nn.Module):
     Args:
         in_channels: Channels of the image.
         side: Side of the image (px).
-        hidden: Width of the first layer.
     """
 
     contrasts: Tensor
@@ -60,7 +61,7 @@ class SlopeEye(nn.Module):
     variance: Tensor
     n_batches: Tensor
 
-    def __init__(self, in_channels: int, side: int, hidden: int = 128) -> None:
+    def __init__(self, in_channels: int, side: int) -> None:
         super().__init__()
         contrasts = OPPONENTS if in_channels == len(OPPONENTS[0]) else BRIGHTNESS
         self.register_buffer("contrasts", torch.tensor(contrasts), persistent=False)
@@ -68,12 +69,12 @@ class SlopeEye(nn.Module):
         self.register_buffer("mean", torch.zeros(n))
         self.register_buffer("variance", torch.ones(n))
         self.register_buffer("n_batches", torch.tensor(0.0))
-        last = nn.Linear(hidden // 2, SLOPE_SIZE)
+        last = nn.Linear(HIDDEN // 2, SLOPE_SIZE)
         nn.init.zeros_(last.weight)
         with torch.no_grad():
             last.bias.copy_(torch.tensor([0.0, 0.0, -1.0]))
         self.judge = nn.Sequential(
-            nn.Linear(n + 3, hidden), nn.SiLU(), nn.Linear(hidden, hidden // 2), nn.SiLU(), last
+            nn.Linear(n + 3, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, HIDDEN // 2), nn.SiLU(), last
         )
         self._side, self._window = side, min(side, MOST_PX)
 
@@ -102,7 +103,13 @@ class SlopeEye(nn.Module):
         return self.judge(torch.cat([alike, uv, diameter.log() + 2.0], dim=1))
 
     def _moments(self, images: Tensor, uv: Tensor, diameter: Tensor) -> Tensor:
-        """(B, n): logarithms of the sums, and moments over sums."""
+        """Logarithms of the sums, and moments over sums, (B, n).
+
+        Args:
+            images: As in `forward`.
+            uv: As in `forward`.
+            diameter: Apparent diameter in image widths, (B, 1).
+        """
         n, window = len(images), self._window
         # Columns and rows of the square, in px of the image and then in diameters from the centre.
         centre = 0.5 * (uv + 1.0) * self._side  # (B, 2)

@@ -85,10 +85,9 @@ class Settings:
         """
         if unknown := sorted({*(self.inputs or ())} - {*INPUTS}):
             raise OptionError(f"unknown input {unknown[0]!r}; choose from {', '.join(INPUTS)}")
-        if unknown := sorted({*self.slopes} - {*manifest.cameras}):
-            raise OptionError(
-                f"unknown camera {unknown[0]!r}; choose from {', '.join(manifest.cameras)}"
-            )
+        cameras = [name for name in manifest.cameras if self.reads(name)]
+        if unknown := sorted({*self.slopes} - {*cameras}):
+            raise OptionError(f"unknown camera {unknown[0]!r}; choose from {', '.join(cameras)}")
         for name in ("batch_size", "dagger_frames", "windows", "window_steps"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}")

@@ -181,6 +181,8 @@ def test_eyes_of_chosen_cameras_tell_slopes_by_moments(dataset, tmp_path):
     torch.testing.assert_close(compiled(images, state, None)[0], slow, atol=1e-6, rtol=0)
     with pytest.raises(OptionError, match="unknown camera 'top'"):
         pretrain(dataset, tmp_path / "other", slopes=("top",), **STEP)
+    with pytest.raises(OptionError, match="unknown camera 'eih'; choose from eth"):
+        pretrain(dataset, tmp_path / "other", inputs=("eth",), slopes=("eih",), **STEP)
 
 
 def test_errors_weigh_by_the_tolerance_unless_told_otherwise(dataset, tmp_path):

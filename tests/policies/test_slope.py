@@ -62,7 +62,7 @@ def test_a_slope_is_learned_in_some_hundred_steps() -> None:
         optimizer.step()
     eye.eval()
     with torch.no_grad():
-        # Whoever says "square on" is off by 0.12 in the median.
+        # To say "square on" every time is off by 0.12 in the median.
         assert error(64).median() < 0.04
 
 
