@@ -17,6 +17,9 @@ A target that is suddenly elsewhere counts as a new one that has not been seen.
 And where the arm may start anywhere, it goes there in one of two plain postures (see
 `hvs_suite.datasets.planner.Planner`).
 
+Over a surface of unknown slope it comes down on a spiral, so that the eye in the hand sees it from
+all sides (see `hvs_suite.datasets.leaning`).
+
 Into a hole it goes down along a funnel (see `hvs_suite.datasets.insertion`). Where the hole is not
 where the pictures show it, nobody sees that, so it goes where they show it, and presses gently.
 """
@@ -30,9 +33,12 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.datasets.expert import Expert
+from hvs_suite.datasets.leaning import on_spiral
+from hvs_suite.datasets.planner import Planner
 from hvs_suite.registry import TASKS
 from hvs_suite.tasks.shared.family import GOAL_UNSEEN
 from hvs_suite.tasks.shared.goal import Goal
+from hvs_suite.tasks.shared.panels import PanelSpec
 from hvs_suite.tasks.shared.peg_and_bushing import PegSpec
 from hvs_suite.tasks.shared.spec import CAMERA_NAMES
 
@@ -72,6 +78,10 @@ class Demonstrator(Expert):
         named = TASKS.get(spec.name)
         starts = {spec.start, named.start if named is not None else spec.start}
         super().__init__(env, plain="random" in starts, clearance_m=CLEARANCE_M)
+        # Leaning to all sides, the wrist of a plain posture would have to turn over.
+        self._near_planner = Planner(
+            self._period_s, embodiment=spec.embodiment, clearance_m=CLEARANCE_M
+        )
         self._looks_down = spec.eth_position_noise_m > 0 or spec.eth_rotation_noise_deg > 0
         self.reset()
 
@@ -100,6 +110,11 @@ class Demonstrator(Expert):
             return self._insertion.learnable_set_point(
                 q, velocity, set_point, goal, spec.caught_mm, gently=bool(self._unseen().any())
             )
+        if isinstance(spec, PanelSpec) and self._has_seen_closely:
+            around, is_near = on_spiral(goal, self._env.tip())
+            planner = self._near_planner if is_near else self._planner
+            planner.avoid(self._env.obstacles)
+            return planner.next_set_point(q, velocity, around)
         return super()._next_set_point(q, velocity, set_point)
 
     def _goal_in(self, ahead_s: float) -> Goal:

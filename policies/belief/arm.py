@@ -63,24 +63,24 @@ def joint_step(motion: FlangeMotion, offset: Tensor, normal: Tensor) -> Tensor:
     Args:
         motion: Of the tip. No gradient flows through it.
         offset: From the tip to where it should be, (B, 3) m; gradients flow.
-        normal: Unit normal that it should face, (B, 3). No gradient flows through it.
+        normal: Unit normal that it should face, (B, 3); gradients flow.
 
     Returns:
         Joint step, (B, 7) rad.
     """
     with torch.no_grad():
-        tool = motion.rotation[:, :, 2]
-        axis = torch.linalg.cross(tool, -normal, dim=1)
-        sine = axis.norm(dim=1, keepdim=True)
-        angle = torch.atan2(sine, -(tool * normal).sum(dim=1, keepdim=True))
-        tilt = axis * (angle.clamp(max=LINEAR_RANGE_RAD) / sine.clamp(min=1e-6))
         into_flange = motion.rotation.transpose(1, 2)[:, :2]
         turning = LEVER_M * into_flange @ motion.jacobian[:, 3:]
         rows = torch.cat([motion.jacobian[:, :3], turning], dim=1)
         gram = rows @ rows.transpose(1, 2)
         gram = gram + DAMPING_M**2 * torch.eye(5, dtype=gram.dtype, device=gram.device)
         inverse = torch.linalg.solve(gram, rows).transpose(1, 2)  # (B, 7, 5)
-        tilt_in_flange = LEVER_M * (into_flange @ tilt[:, :, None])[:, :, 0]
+    tool = motion.rotation[:, :, 2].detach()
+    axis = torch.linalg.cross(tool, -normal, dim=1)
+    sine = axis.norm(dim=1, keepdim=True)
+    angle = torch.atan2(sine, -(tool * normal).sum(dim=1, keepdim=True))
+    tilt = axis * (angle.clamp(max=LINEAR_RANGE_RAD) / sine.clamp(min=1e-6))
+    tilt_in_flange = LEVER_M * (into_flange @ tilt[:, :, None])[:, :, 0]
     length = offset.norm(dim=1, keepdim=True)
     near = offset * (LINEAR_RANGE_M / length.clamp(min=LINEAR_RANGE_M))
     error = torch.cat([near, tilt_in_flange], dim=1)

@@ -45,6 +45,8 @@ OUT_BOUNDS = (6.0, 8.0, 6.0)
 nearly always grows so sure that what it should learn of the rest changes nothing any more."""
 HEIGHTS_M = (0.0, 0.05, 0.15)
 """Above the goal, along its normal: the plain postures that the head is shown."""
+MOST_LEAN = 1.0
+"""Tangent of the angle by which the head may let the tool lean to a side."""
 RECENT_SIZE = 4
 """What is remembered beside belief and set point: for how long each camera has not seen the target
 (two), and a trace of what was forgotten (two)."""
@@ -197,7 +199,8 @@ class BeliefNetwork(nn.Module):
         way_width = n_ways * (2 * (N_JOINTS - 1) + 2)
         # To which point by the goal: sideways (two) and along the normal, how far ahead, and what
         # is added for where the tip is, and where it was sent.
-        guide_last = nn.Linear(128, 6)
+        # With slopes to see, also how far to lean to either side of the base frame.
+        guide_last = nn.Linear(128, 8 if shape.slopes else 6)
         nn.init.zeros_(guide_last.weight)
         nn.init.zeros_(guide_last.bias)
         self.guide = nn.Sequential(
@@ -424,10 +427,16 @@ class BeliefNetwork(nn.Module):
         waypoint = ahead + (side @ by[:, :2, None])[:, :, 0] + by[:, 2:] * normal
         # The arm trails its set point. What is sent farther, so that it arrives, is linear in where
         # it stands: exactly what a network on a logarithmic scale says only roughly.
-        gain = self.feedback + 0.5 * torch.tanh(guided[:, 4:])
+        gain = self.feedback + 0.5 * torch.tanh(guided[:, 4:6])
         waypoint = waypoint + gain[:, :1] * (ahead - here.position)
         waypoint = waypoint + gain[:, 1:] * (ahead - sent.position)
-        proposals = [arm.joint_step(sent, waypoint - sent.position, normal)]
+        facing = normal.detach()
+        if self.shape.slopes:
+            facing = _leaning(facing, MOST_LEAN * torch.tanh(guided[:, 6:]))
+            # About the target, so that it stays in view.
+            reach = self.belief.standoff.float() + by[:, 2:]
+            waypoint = waypoint + reach * (facing - normal.detach())
+        proposals = [arm.joint_step(sent, waypoint - sent.position, facing)]
         joints, velocity = self._moving(memory, state)
         ways = []
         tool = self.cell.tool_length_m
@@ -584,3 +593,11 @@ class BeliefNetwork(nn.Module):
         """Inverse of `to_action` without the clipping: what the head should have said, (B, 7)."""
         step = action * self.joint_range - memory[:, SET_POINT].float()
         return torch.asinh(step / self.shape.error_scale)
+
+
+def _leaning(normal: Tensor, lean: Tensor) -> Tensor:
+    """A unit normal (B, 3) leaning by tangents (B, 2) to the base frame's x and y across it."""
+    x = normal.new_tensor([1.0, 0.0, 0.0]) - normal[:, :1] * normal
+    x = x / x.norm(dim=1, keepdim=True)
+    leaning = normal + lean[:, :1] * x + lean[:, 1:] * torch.linalg.cross(normal, x, dim=1)
+    return leaning / leaning.norm(dim=1, keepdim=True)

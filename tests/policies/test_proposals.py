@@ -1,13 +1,18 @@
 """The head: what it chooses from while no camera has seen the target, and what it answers."""
 
+import math
+
 import numpy as np
 import torch
+import torch.nn.functional as F  # noqa: N812
 
 import hvs_suite
 from hvs_suite.datasets.features import STATE, observed_part
 from hvs_suite.datasets.looking import Demonstrator
+from hvs_suite.policies.belief import arm
 from hvs_suite.policies.belief.cell_model import cell_model
 from hvs_suite.policies.belief.eye import SIGHTING_SIZE
+from hvs_suite.policies.belief.geometry import flange_motion
 from hvs_suite.policies.belief.network import BeliefNetwork, Shape
 
 UNSEEN = 5  # of the dev split: the arm, upright, hides the target from the eye to hand
@@ -42,3 +47,30 @@ def test_no_zero_has_a_sign_because_logs_are_twice_as_long_with_it() -> None:
     action = network.to_action(torch.zeros(1, 7), memory)
     assert (action == 0.0).any()
     assert not torch.signbit(action[action == 0.0]).any()
+
+
+def test_a_head_that_sees_slopes_can_lean_around_the_target() -> None:
+    torch.manual_seed(0)
+    spec = hvs_suite.load("surface-tilted", observations="state").spec
+    shape = Shape({"eih": (3, 64)}, hidden=8, slopes=("eih",))
+    network = BeliefNetwork(shape, cell_model(spec))
+    target, standoff_m, lean = torch.tensor([[0.5, 0.2, 0.1]]), 0.05, math.radians(20.0)
+    with torch.no_grad():
+        network.belief.prior[:3] = target[0]
+        network.belief.standoff.fill_(standoff_m)
+        network.guide[-1].bias[6:] = torch.atanh(torch.tensor([0.0, math.tan(lean)]))
+    up = torch.tensor([[0.0, 0.0, 1.0]])
+    q = F.pad(arm.postures(target + standoff_m * up, up)[:, 0], (0, 1))
+    memory = network.start(1)
+    sightings = {"eih": torch.zeros(1, SIGHTING_SIZE)}
+    for _ in range(20):
+        memory = network.sent_on(memory, q.double())
+        decision = network.decide(memory, sightings, F.pad(q, (0, 7)))
+        q = q + network.to_step(decision.proposals[:, 0]).detach()
+    motion = flange_motion(q)
+    facing = torch.tensor([[0.0, math.sin(lean), math.cos(lean)]])
+    torch.testing.assert_close(-motion.rotation[:, :, 2], facing, atol=2e-3, rtol=0.0)
+    torch.testing.assert_close(motion.position, target + standoff_m * facing, atol=5e-4, rtol=0.0)
+    # And it can be taught to.
+    decision.proposals[:, 0].sum().backward()
+    assert (network.guide[-1].bias.grad[6:] != 0.0).all()
