@@ -1,4 +1,6 @@
-"""A clip of a success and of a failure of each entry but ``random``'s, drawn from its action log.
+"""A clip of a success and of a failure of each entry, drawn from its action log.
+
+There is none of ``random``, from which nobody learns anything, nor of ``zero``, which stands still.
 
 Clips are animated AVIF: a picture to the page, so it plays from a file, on a phone, inside the
 page, without a player (iOS does not play a video out of a ``data:`` address). Browsers have had it
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
 
 FOLDER: Final = "clips"
 Kind = Literal["success", "failure"]
+_NOT_DRAWN: Final = UNWATCHED, "zero"
 
 # Raised when clips are drawn otherwise than before: their names, and so all of them, change.
 _STYLE: Final = 1
@@ -129,7 +132,7 @@ def clips(
     orders = [
         _Order(entry, kind, row, _path(folder, entry, kind, row))
         for entry in submissions
-        if entry.result.summary.policy != UNWATCHED
+        if entry.result.summary.policy not in _NOT_DRAWN
         for kind, row in choose(entry.result)
     ]
     missing = [order for order in orders if not order.path.exists()]
