@@ -32,6 +32,9 @@ from hvs_suite.tasks.shared.spec import Spec
 
 LOGGED_OF_BUILTIN = 50
 """Scenarios that the log of a built-in policy holds: it can play the others again."""
+LOGGED_OF_SHIPPED = 250
+"""The same of shipped weights. They play exactly again only where a processor rounds alike, so more
+of what they did is kept."""
 UNWATCHED = "random"
 """Nobody learns anything from watching this policy: one scenario is logged, and no clip drawn."""
 
@@ -178,8 +181,11 @@ class _Evaluation:
         """The result of all trials, and their action log."""
         player, spec = self.player, self.spec
         rows = [trial.row for trial in trials]
-        plays_again = player.kind == "builtin" and not self.origin["options"]
-        most = 1 if player.name == UNWATCHED else LOGGED_OF_BUILTIN
+        is_ours = result_file.is_ours(player.name, player.kind)
+        plays_again = is_ours and not self.origin["options"]
+        most = LOGGED_OF_SHIPPED if player.name in catalogue.SHIPPED else LOGGED_OF_BUILTIN
+        if player.name == UNWATCHED:
+            most = 1
         n_logged = min(most, len(rows)) if plays_again else len(rows)
         log = action_log.encode([trial.actions for trial in trials[:n_logged]])
         judged_by: dict[str, Any] = {

@@ -18,6 +18,7 @@ import pydantic
 
 from hvs_suite import files, reading, statistics
 from hvs_suite.errors import ResultError
+from hvs_suite.policies import catalogue
 
 SCHEMA_VERSION: Final = 3
 SCALES = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 20.0, 50.0, 100.0)
@@ -439,8 +440,9 @@ class Result(_Block):
             raise ValueError("all rows must have the same metrics")
         if not self.metadata.tolerances.keys() <= metrics:
             raise ValueError("metadata.tolerances bounds what is no metric")
-        n_logged, kind = self.metadata.n_logged, self.metadata.policy_kind
-        if n_logged > len(self.episodes) or (n_logged < len(self.episodes) and kind != "builtin"):
+        n_logged = self.metadata.n_logged
+        plays_again = is_ours(self.summary.policy, self.metadata.policy_kind)
+        if n_logged > len(self.episodes) or (n_logged < len(self.episodes) and not plays_again):
             raise ValueError("metadata.n_logged must be the number of rows")
         if n_logged < len(self.episodes) and self.metadata.options:
             raise ValueError("metadata.n_logged must be the number of rows where there are options")
@@ -457,6 +459,11 @@ class Result(_Block):
             if not _close(getattr(ours, name), value):
                 raise ValueError(f"summary.{name} is not what the episodes give")
         return self
+
+
+def is_ours(policy: str, kind: str) -> bool:
+    """Returns whether a policy is one of the suite's own, which can play again."""
+    return policy in catalogue.NAMES and kind in ("builtin", "checkpoint")
 
 
 def actions_path(path: Path) -> Path:

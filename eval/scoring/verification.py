@@ -19,7 +19,7 @@ import numpy as np
 
 from hvs_suite import registry, rollout
 from hvs_suite.datasets.lerobot_files import INFO
-from hvs_suite.errors import OptionError, ResultError
+from hvs_suite.errors import OptionError, PolicyError, ResultError
 from hvs_suite.eval.scoring import action_log, contender, result_file
 from hvs_suite.eval.scoring.comparison import Tally
 from hvs_suite.eval.scoring.result_file import EpisodeRow, Result
@@ -58,7 +58,7 @@ class Verdict:
         n_episodes: Scenarios of the result.
         n_played: Those that were played again.
         n_near: Those of them whose outcome rounding decided, at a bound on an error.
-        n_other: Those of them in which the built-in policy, playing again from pictures, went
+        n_other: Those of them in which the policy itself, playing again from pictures, went
             another way than the file says.
         nonce: What a sample was drawn with; None where all were played.
         largest: Largest difference of a metric, by unit.
@@ -139,10 +139,10 @@ def verify(
 ) -> Verdict:
     """Checks a result file against its action log and the task.
 
-    A built-in policy that looks plays again what is not logged. The least difference of rounding
-    between two processors can pass through its pictures and estimates and lead it another way, so
-    there the file need not agree row by row: what it claims to be solved is compared with what is
-    solved now, by McNemar's exact test.
+    A policy of the suite plays again what is not logged. Where it looks, the least difference of
+    rounding between two processors can pass through its pictures and estimates and lead it another
+    way, so there the file need not agree row by row: what it claims to be solved is compared with
+    what is solved now, by McNemar's exact test.
 
     Args:
         path: The result; its action log stands beside it.
@@ -213,34 +213,43 @@ def verify(
 def _in_parts(
     path: Path, result: Result, chosen: Sequence[int], n_logged: int
 ) -> Iterator[tuple[list[int], rollout.PolicyFactory, bool]]:
-    """What is logged is replayed without pictures; a built-in policy plays the rest itself."""
+    """What is logged is replayed without pictures; the policy itself plays the rest."""
     logged = [index for index in chosen if index < n_logged]
     if logged:
         yield logged, builtin.make_zero, False
     rest = [index for index in chosen if index >= n_logged]
     if rest:
-        player = builtin_policy(path, result)
+        player = named_policy(path, result)
         yield rest, player.make, player.looks
 
 
-def builtin_policy(path: Path, result: Result) -> contender.Contender:
-    """Returns the built-in policy that a result names.
+def named_policy(path: Path, result: Result) -> contender.Contender:
+    """Returns the suite's own policy that a result names: a built-in one, or shipped weights.
 
     Args:
         path: The result's file.
         result: What it holds.
 
     Raises:
-        ResultError: There is none of this name. Any other name is not looked for: a stranger's file
-            must not choose code to run or weights to load.
+        ResultError: There is none of this name, or it has other weights by now. Any other name is
+            not looked for: a stranger's file must not choose code to run or weights to load.
     """
-    policy = result.summary.policy
-    if policy not in catalogue.BUILTIN:
+    policy, task = result.summary.policy, result.summary.task
+    if policy not in catalogue.NAMES:
         raise ResultError(
-            f"{path}: {shown(policy)!r} is no built-in policy, but the action log does not hold "
-            "all scenarios; evaluate again"
+            f"{path}: {shown(policy)!r} is no policy of the suite, but the action log does not "
+            "hold all scenarios; evaluate again"
         )
-    return contender.find(policy, result.summary.task)
+    try:
+        player = contender.find(policy, task)
+    except PolicyError as error:
+        raise ResultError(f"{path}: {error}") from error
+    if player.hash != result.metadata.policy_hash:
+        raise ResultError(
+            f"{path}: was made with other {policy} weights than this version ships for {task}, so "
+            "what the action log does not hold cannot be played again; evaluate again"
+        )
+    return player
 
 
 def check_task(path: Path, result: Result) -> None:

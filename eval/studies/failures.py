@@ -154,7 +154,7 @@ def sort_failures(
     with contextlib.closing(registry.load(summary.task, split=summary.split, **options)) as env:
         unlogged = None
         if result.metadata.n_logged < len(result.episodes):
-            unlogged = verification.builtin_policy(path, result).make(env)
+            unlogged = verification.named_policy(path, result).make(env)
         for row in result.episodes:
             if row.success:
                 continue

@@ -323,6 +323,21 @@ def test_a_policy_that_looks_may_go_another_way_if_it_solves_as_many(tmp_path: P
         verification.verify(with_lost(path, tmp_path / "eight", range(2, 10)))
 
 
+def test_shipped_weights_play_again_what_is_not_logged_and_no_others(tmp_path: Path) -> None:
+    path = tmp_path / "pretrained.json"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(protocol, "LOGGED_OF_SHIPPED", 2)
+        protocol.evaluate("pretrained", TASK, path, episodes=4)
+    result = result_file.load(path)
+    assert len(verification.load_actions(path, result)) == 2
+    verdict = verification.verify(path)
+    assert (verdict.n_played, verdict.n_other, verdict.largest["mm"]) == (4, 0, 0.0)
+    other = result.metadata.model_copy(update={"policy_hash": "0" * 64})
+    result_file.write(result.model_copy(update={"metadata": other}), path)
+    with pytest.raises(ResultError, match="other pretrained weights than this version ships"):
+        verification.verify(path)
+
+
 @pytest.mark.parametrize("policy", ["trapped:make", "hvs_suite_none", "./expert", "finetuned"])
 def test_no_file_names_the_code_that_verifying_runs(
     policy: str, partly_logged: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -331,7 +346,9 @@ def test_no_file_names_the_code_that_verifying_runs(
     monkeypatch.chdir(tmp_path)
     path = altered(partly_logged, tmp_path, 3, policy)
     for look in (verification.verify, failures.sort_failures):
-        with pytest.raises(ResultError, match="is no built-in policy, but the action log"):
+        with pytest.raises(
+            ResultError, match=r"n_logged must be the number of rows|no finetuned weights"
+        ):
             look(path)
 
 
