@@ -37,8 +37,8 @@ def on_spiral(goal: Goal, tip: Tip) -> tuple[Goal, bool]:
         tip: Where the tool is.
 
     Returns:
-        A place around the target; `goal` itself where it is near, or where the arm reaches no
-        place that leans.
+        A place around the target, or `goal` itself where it is near and where the arm reaches no
+        place that leans; and whether the tip is on the spiral already.
     """
     left_m = float(np.linalg.norm(tip.position - goal.target)) - goal.standoff_m
     share = min((left_m - AHEAD_M) / RANGE_M, 1.0)
