@@ -190,7 +190,7 @@ def test_the_page_is_well_formed_and_asks_the_network_for_nothing(made: Path) ->
     assert checker.open_tags == []
     assert len(set(checker.identities)) == len(checker.identities)
     assert not re.search(r"https?:|@import|url\(", text)
-    assert len(reel_of(text)) == 3
+    assert len(reel_of(text)) == 2
 
 
 def test_the_page_says_how_to_submit(made: Path) -> None:

@@ -34,13 +34,15 @@ class Load:
 @pytest.mark.parametrize(("kind", "task"), SHIPPED)
 def test_shipped_weights_solve_scenes_that_nobody_trained_on(kind, task):
     make = catalogue.policy_factory(kind, task)
-    episodes = rollout(Load(task), make, range(5))
     summary = result_file.load(RESULTS / kind / f"{task}.json").summary
+    # Five scenes say little of weights that lose many.
+    n = 5 if summary.pc_success >= 90.0 else 20
+    episodes = rollout(Load(task), make, range(n))
     # Fewer solved than this, or more collisions, happens once in fifty times to weights that are as
     # good as the board says.
-    usual = scipy.stats.binom.ppf(0.02, 5, summary.n_success / summary.n_episodes)
-    assert sum(episode.success for episode in episodes) >= min(4, usual)
-    most = scipy.stats.binom.ppf(0.98, 5, summary.n_collision / summary.n_episodes)
+    usual = scipy.stats.binom.ppf(0.02, n, summary.n_success / summary.n_episodes)
+    assert sum(episode.success for episode in episodes) >= min(0.8 * n, usual)
+    most = scipy.stats.binom.ppf(0.98, n, summary.n_collision / summary.n_episodes)
     assert sum(episode.collision for episode in episodes) <= most
 
 
