@@ -103,7 +103,8 @@ class Shape:
             where the arm starts, and from there on where it has sent it.
         reads_velocities: Whether measured joint velocities are read; without them they count as 0.
         slopes: Cameras whose eyes tell slopes by image moments, see
-            `hvs_suite.policies.belief.slope`.
+            `hvs_suite.policies.belief.slope`. With any, the head may let the tool lean about the
+            target.
     """
 
     cameras: Mapping[str, tuple[int, int]]

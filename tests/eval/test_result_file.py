@@ -245,7 +245,7 @@ BROKEN: dict[str, tuple[Any, str]] = {
         lambda c: c["episodes"]["settled"]["errors"].pop("tilt_error_deg"),
         "must have the metrics of errors",
     ),
-    "a log of fewer scenarios, of code of somebody": (
+    "a log of fewer scenarios, of somebody's code": (
         lambda c: c["metadata"].update(n_logged=3, policy_kind="module"),
         "n_logged must be the number of rows",
     ),
