@@ -12,7 +12,9 @@ to see it. So until the eye in hand has seen the target, the demonstrator heads 
 it, from which the eye in hand can see it. Above a target that moves, it moves along. If no camera
 sees it from there, the eye-to-hand camera saw too little of it, and it looks again.
 
-A target that is suddenly elsewhere counts as a new one that has not been seen.
+A target that is suddenly elsewhere counts as a new one that has not been seen. But once both
+cameras have seen the same target, it is known how far off the eye-to-hand camera shows them, and
+the demonstrator goes straight to those that follow.
 
 And where the arm may start anywhere, it goes there in one of two plain postures (see
 `hvs_suite.datasets.planner.Planner`).
@@ -86,22 +88,30 @@ class Demonstrator(Expert):
         self.reset()
 
     def reset(self) -> None:
-        """Forget that the target was seen: a new episode begins."""
-        self._target: FloatArray | None = None
-        self._has_seen = False
+        """Forget what was seen: a new episode begins."""
+        self._knows_offset = not self._looks_down
+        self._begin_target(None)
+
+    def _begin_target(self, target: FloatArray | None) -> None:
+        self._target = target
+        self._seen_by: set[str] = set()
         self._n_looked = 0
-        self._has_seen_closely = not self._looks_down
+
+    @property
+    def _has_seen_closely(self) -> bool:
+        """Whether it is known exactly enough where the target is to go there."""
+        return self._knows_offset or "eih" in self._seen_by
 
     def _next_set_point(
         self, q: FloatArray, velocity: FloatArray, set_point: FloatArray
     ) -> FloatArray:
         goal = self._env.goal()
         if self._target is not None and not _is_same(self._target, goal):
-            self.reset()
+            self._begin_target(goal.target)
         self._target = goal.target
-        if not (self._has_seen and self._has_seen_closely):
+        if not (self._seen_by and self._knows_offset):
             self._look()
-        if not self._has_seen:
+        if not self._seen_by:
             ahead = self._planner.towards_posture(q, velocity, self._next_look(q))
             if ahead is not None:
                 return ahead
@@ -134,12 +144,13 @@ class Demonstrator(Expert):
         return np.asarray(looks[self._n_looked])
 
     def _look(self) -> None:
-        """Notice whether a camera has the target in view."""
+        """Notice which cameras have the target in view."""
         truth, [target, *_] = self._env.privileged(), self._env.spec.keypoints
-        seen = {name: truth[f"{target}_{name}"][3] > 0.5 for name in CAMERA_NAMES}
-        self._has_seen_closely = self._has_seen_closely or bool(seen["eih"])
-        in_vain = not self._has_seen_closely and self._waits_above()
-        self._has_seen = (self._has_seen and not in_vain) or any(seen.values())
+        seen = {name for name in CAMERA_NAMES if truth[f"{target}_{name}"][3] > 0.5}
+        if "eih" not in seen and not self._has_seen_closely and self._waits_above():
+            self._seen_by.clear()
+        self._seen_by |= seen
+        self._knows_offset = self._knows_offset or self._seen_by.issuperset(CAMERA_NAMES)
 
     def _waits_above(self) -> bool:
         """Whether the arm rests as high as where the eye in the hand looks from, or higher.

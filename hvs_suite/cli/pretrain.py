@@ -47,6 +47,8 @@ class Pretrain(Players):
         window_steps: Length of each.
         slopes: Cameras whose eyes tell the slope of the surface by image moments, joined by +; for
             surfaces that lean.
+        offsets: Cameras whose pose is not exact, joined by +: the belief finds out how far off they
+            show a target; for targets in sequence.
         batch_size: Frames that the eyes learn from in a step.
         learning_rate: Peak of the schedule.
         seed: Seed of the initial weights, the held-out episodes and the order.
@@ -67,6 +69,7 @@ class Pretrain(Players):
     windows: int = 48
     window_steps: int = 16
     slopes: str | None = None
+    offsets: str | None = None
     batch_size: int = 64
     learning_rate: float = 2e-3
     seed: int = 0
@@ -95,6 +98,7 @@ class Pretrain(Players):
                 windows=self.windows,
                 window_steps=self.window_steps,
                 slopes=() if self.slopes is None else tuple(self.slopes.split("+")),
+                offsets=() if self.offsets is None else tuple(self.offsets.split("+")),
                 batch_size=self.batch_size,
                 learning_rate=self.learning_rate,
                 workers=self.players(local=2),

@@ -7,6 +7,10 @@ sighting is a ray, on which the target's size says how far away it is. How far t
 them, how much a target may have moved, and when to forget it because it is suddenly elsewhere, a
 small network decides from how well what is seen fits what was believed.
 
+A camera whose pose is not exact shows everything off by nearly the same. Where it is said to, the
+filter finds out by how much, from what another camera sees of the same target, and does not forget
+it with the target.
+
 Double precision: variances of a tenth of a millimetre and of half a metre meet in one matrix.
 """
 
@@ -67,6 +71,8 @@ class Prior:
         slope_variance: Of each.
         standoff_m: From the target along its normal to the goal of the tip (m).
         sizes: Camera name to apparent diameter (image widths) times depth (m).
+        offsets: Camera name to the covariance of how far off it shows a target, (3, 3).
+        drifts: Camera name to how much of that differs from target to target, (3, 3).
     """
 
     place: Tensor
@@ -75,6 +81,8 @@ class Prior:
     slope_variance: float
     standoff_m: float
     sizes: Mapping[str, float]
+    offsets: Mapping[str, Tensor]
+    drifts: Mapping[str, Tensor]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -99,17 +107,35 @@ class Belief(nn.Module):
         cameras: Their names.
         period_s: Control period (s).
         hidden: Width of the network that sets the noises.
+        offsets: Cameras of which it finds out how far off they show a target.
+
+    Attributes:
+        size: Numbers of a belief: `BELIEF_SIZE`, and then the offsets, their covariance with what
+            moves, and their own.
     """
 
     prior: Tensor
     standoff: Tensor
     sizes: Tensor
+    offsets: Tensor
+    drifts: Tensor
     transition: Tensor
+    shows: Tensor
 
-    def __init__(self, cameras: tuple[str, ...], period_s: float, hidden: int = 64) -> None:
+    def __init__(
+        self,
+        cameras: tuple[str, ...],
+        period_s: float,
+        hidden: int = 64,
+        *,
+        offsets: tuple[str, ...] = (),
+    ) -> None:
         super().__init__()
         self.cameras = cameras
         n = len(cameras)
+        self._off = off = 3 * len(offsets)
+        self._of_offsets = tuple(cameras.index(name) for name in offsets)
+        self.size = BELIEF_SIZE + off * (1 + N_MOTION + off)
         start = torch.zeros(BELIEF_SIZE, dtype=torch.float64)
         start[COVARIANCE] = torch.diag(
             torch.tensor([0.25] * 3 + [1e-8] * 6, dtype=torch.float64)
@@ -118,8 +144,18 @@ class Belief(nn.Module):
         self.register_buffer("prior", start)
         self.register_buffer("standoff", torch.tensor(0.05, dtype=torch.float64))
         self.register_buffer("sizes", torch.full((n,), 0.02, dtype=torch.float64))
+        for name in ("offsets", "drifts"):
+            start_off = 1e-4 * torch.eye(off, dtype=torch.float64)
+            self.register_buffer(name, start_off, persistent=off > 0)
         eye3 = torch.eye(3, dtype=torch.float64)
-        transition = torch.eye(N_MOTION, dtype=torch.float64)
+        # Of place and offsets, what each camera shows: the place, and its own offset with it.
+        shows = torch.zeros(n, 3, 3 + off, dtype=torch.float64)
+        shows[:, :, :3] = eye3
+        for i, camera in enumerate(self._of_offsets):
+            shows[camera, :, 3 * i + 3 : 3 * i + 6] = eye3
+        self.register_buffer("shows", shows, persistent=False)
+        self._shown = [0, 1, 2, *range(N_MOTION, N_MOTION + off)]
+        transition = torch.eye(N_MOTION + off, dtype=torch.float64)
         transition[PLACE, VELOCITY] = transition[VELOCITY, ACCELERATION] = period_s * eye3
         transition[PLACE, ACCELERATION] = 0.5 * period_s**2 * eye3
         self.register_buffer("transition", transition, persistent=False)
@@ -130,7 +166,7 @@ class Belief(nn.Module):
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
         self.gate = nn.Sequential(
-            nn.Linear(FEATURES_A_CAMERA * n + FEATURES, hidden), nn.SiLU(), last
+            nn.Linear(FEATURES_A_CAMERA * n + FEATURES + off, hidden), nn.SiLU(), last
         )
 
     def set_prior(self, prior: Prior) -> None:
@@ -143,10 +179,16 @@ class Belief(nn.Module):
         self.standoff.fill_(prior.standoff_m)
         for i, name in enumerate(self.cameras):
             self.sizes[i] = prior.sizes[name]
+        for i, camera in enumerate(self._of_offsets):
+            k = slice(3 * i, 3 * i + 3)
+            self.offsets[k, k] = prior.offsets[self.cameras[camera]]
+            self.drifts[k, k] = prior.drifts[self.cameras[camera]]
 
     def start(self, n: int) -> Tensor:
         """What is believed before anything is seen, (n, k) float64."""
-        return self.prior.expand(n, BELIEF_SIZE).clone()
+        unknown = self.prior.new_zeros(self._off * (1 + N_MOTION))
+        start = torch.cat([self.prior, unknown, self.offsets.flatten()])
+        return start.expand(n, self.size).clone()
 
     def forward(
         self, belief: Tensor, sightings: Mapping[str, Tensor], views: Mapping[str, View]
@@ -164,10 +206,13 @@ class Belief(nn.Module):
         """
         n = len(belief)
         F = self.transition
-        x = belief[:, MOTION] @ F.T
-        P = F @ belief[:, COVARIANCE].view(n, N_MOTION, N_MOTION) @ F.T
+        x, P = self._state(belief)
+        x, P = x @ F.T, F @ P @ F.T
         slope, slope_var = belief[:, TILT], belief[:, TILT_VARIANCE]
-        looks = [self._look(i, x, P, sightings[c], views[c]) for i, c in enumerate(self.cameras)]
+        looks = [
+            self._look(i, *self._as_shown(i, x, P), sightings[c], views[c])
+            for i, c in enumerate(self.cameras)
+        ]
         features = [look.features for look in looks]
         variances = torch.diagonal(P, dim1=1, dim2=2).clamp(min=1e-14)
         features.append(
@@ -179,41 +224,79 @@ class Belief(nn.Module):
         keep = 1.0 - forget
         start = self.prior
         prior_P = start[COVARIANCE].view(N_MOTION, N_MOTION)
-        x = keep * x + forget * start[MOTION]
-        P = keep[:, :, None] * P + forget[:, :, None] * prior_P
+        new_x, new_P = self._anew(x, P)
+        x = keep * x + forget * new_x
+        P = keep[:, :, None] * P + forget[:, :, None] * new_P
         prior_variance = torch.diagonal(prior_P)
         change = torch.exp((CHANGE_SLOPE * common[:, 1:]).clamp(-6.0, 6.0))
         # Velocities change by accelerations, and hardly otherwise.
         of_prior = prior_variance[3:] * torch.tensor([1e-6] * 3 + [1e-3] * 3, dtype=P.dtype)
         q = torch.cat([1e-10 * change[:, :1].expand(n, 3), of_prior * change[:, 1:2]], dim=1)
+        q = nn.functional.pad(q, (0, self._off))
         P = P + torch.diag_embed(q)
         slope = keep * slope + forget * start[TILT]
         slope_var = keep * slope_var + forget * start[TILT_VARIANCE] + 1e-8 * change[:, 2:]
         # What the cameras say of the place, as information.
-        info = P.new_zeros(n, 3, 3)
-        vector = P.new_zeros(n, 3)
+        A = self._shown
+        info = P.new_zeros(n, len(A), len(A))
+        vector = P.new_zeros(n, len(A))
         for i, look in enumerate(looks):
             gate = gates[:, GATES_A_CAMERA * i : GATES_A_CAMERA * (i + 1)]
-            Lambda, point = self._measure(i, look, x, P, gate)
-            info = info + Lambda
-            vector = vector + (Lambda @ (point - x[:, :3])[:, :, None])[:, :, 0]
-        eye3 = torch.eye(3, dtype=P.dtype)
-        middle = torch.linalg.inv(eye3 + info @ P[:, :3, :3])  # (I + L P)^-1
-        gain = P[:, :, :3] @ middle  # (B, 9, 3), acts on information
+            place, spread = self._as_shown(i, x, P)
+            Lambda, point = self._measure(i, look, place, spread, gate)
+            H = self.shows[i]
+            info = info + H.T @ Lambda @ H
+            vector = vector + (H.T @ Lambda @ (point - place)[:, :, None])[:, :, 0]
+        eye = torch.eye(len(A), dtype=P.dtype)
+        middle = torch.linalg.inv(eye + info @ P[:, A][:, :, A])  # (I + L P)^-1
+        gain = P[:, :, A] @ middle  # acts on information
         x = x + (gain @ vector[:, :, None])[:, :, 0]
-        P = P - gain @ info @ P[:, :3, :]
-        P = 0.5 * (P + P.transpose(1, 2)) + 1e-13 * torch.eye(N_MOTION, dtype=P.dtype)
+        P = P - gain @ info @ P[:, A, :]
+        P = 0.5 * (P + P.transpose(1, 2)) + 1e-13 * torch.eye(P.shape[1], dtype=P.dtype)
         for i, look in enumerate(looks):
             gate = gates[:, GATES_A_CAMERA * i : GATES_A_CAMERA * (i + 1)]
             seen, variance = self._facing(i, look, gate)
             share = slope_var / (slope_var + variance)
             slope = slope + share * (seen - slope)
             slope_var = slope_var * (1.0 - share)
-        updated = torch.cat([x, P.flatten(1), slope, slope_var.clamp(min=1e-12)], dim=1)
-        return updated, forget
+        m = MOTION
+        updated = [x[:, m], P[:, m, m].flatten(1), slope, slope_var.clamp(min=1e-12)]
+        if self._off:
+            updated += [x[:, N_MOTION:], P[:, m, N_MOTION:].flatten(1)]
+            updated.append(P[:, N_MOTION:, N_MOTION:].flatten(1))
+        return torch.cat(updated, dim=1), forget
 
-    def _look(self, i: int, x: Tensor, P: Tensor, sighting: Tensor, view: View) -> "_Look":
-        """A sighting as a ray, and how it fits what is believed."""
+    def _state(self, belief: Tensor) -> tuple[Tensor, Tensor]:
+        """What moves and the offsets, (B, m), and their covariance (B, m, m)."""
+        n, off = len(belief), self._off
+        x, P = belief[:, MOTION], belief[:, COVARIANCE].view(n, N_MOTION, N_MOTION)
+        if not off:
+            return x, P
+        offsets, both, own = belief[:, BELIEF_SIZE:].split([off, N_MOTION * off, off * off], dim=1)
+        both = both.view(n, N_MOTION, off)
+        upper = torch.cat([P, both], dim=2)
+        lower = torch.cat([both.transpose(1, 2), own.view(n, off, off)], dim=2)
+        return torch.cat([x, offsets], dim=1), torch.cat([upper, lower], dim=1)
+
+    def _anew(self, x: Tensor, P: Tensor) -> tuple[Tensor, Tensor]:
+        """The state of `_state` for another target: the cameras are off as before, or nearly."""
+        start = self.prior
+        prior_P = start[COVARIANCE].view(N_MOTION, N_MOTION)
+        if not self._off:
+            return start[MOTION], prior_P
+        own = P[:, N_MOTION:, N_MOTION:] + self.drifts
+        corner = prior_P.expand(len(x), -1, -1)
+        new_P = nn.functional.pad(corner, (0, self._off, 0, self._off))
+        new_P = new_P + nn.functional.pad(own, (N_MOTION, 0, N_MOTION, 0))
+        return torch.cat([start[MOTION].expand(len(x), -1), x[:, N_MOTION:]], dim=1), new_P
+
+    def _as_shown(self, i: int, x: Tensor, P: Tensor) -> tuple[Tensor, Tensor]:
+        """Where a camera shows the target, (B, 3) m, and the covariance, (B, 3, 3)."""
+        H, A = self.shows[i], self._shown
+        return x[:, A] @ H.T, H @ P[:, A][:, :, A] @ H.T
+
+    def _look(self, i: int, place: Tensor, P: Tensor, sighting: Tensor, view: View) -> "_Look":
+        """A sighting as a ray, and how it fits where the camera should show the target."""
         s = sighting.double()
         uv = s[:, UV].clamp(-1.6, 1.6) * view.tan
         ray = torch.cat([uv, torch.ones_like(uv[:, :1])], dim=1)
@@ -221,11 +304,11 @@ class Belief(nn.Module):
         direction = (view.rotation @ (ray / length)[:, :, None])[:, :, 0]
         by_size = self.sizes[i] * torch.exp(-s[:, LOG_DIAMETER].clamp(-6.0, 1.0)) * length
         by_size = by_size.clamp(MIN_DEPTH_M, MAX_DEPTH_M)
-        offset = x[:, :3] - view.origin
+        offset = place - view.origin
         along = (offset * direction).sum(dim=1, keepdim=True)
         miss = offset - along * direction
         miss_m = miss.norm(dim=1, keepdim=True)
-        spread = torch.diagonal(P[:, :3, :3], dim1=1, dim2=2).sum(dim=1, keepdim=True).sqrt()
+        spread = torch.diagonal(P, dim1=1, dim2=2).sum(dim=1, keepdim=True).sqrt()
         sigma_m = s[:, LOG_SIGMA_UV].exp() * view.tan * by_size
         doubt = torch.sqrt(spread**2 + sigma_m**2)
         visible = s[:, VISIBLE]
@@ -246,7 +329,7 @@ class Belief(nn.Module):
         return _Look(s, view, direction, length, by_size, features.float())
 
     def _measure(
-        self, i: int, look: "_Look", x: Tensor, P: Tensor, gate: Tensor
+        self, i: int, look: "_Look", place: Tensor, P: Tensor, gate: Tensor
     ) -> tuple[Tensor, Tensor]:
         """What a ray says of the place: information (B, 3, 3), and the point on it (B, 3)."""
         s, d = look.sighting, look.direction
@@ -254,10 +337,10 @@ class Belief(nn.Module):
         loud = torch.exp(2.0 * torch.tanh(gate[:, :3] / 2.0) * 2.0)  # of variances, e^-4 to e^4
         share_var = (s[:, LOG_SIGMA_SIZE].exp() ** 2 + log_floors[2].exp() ** 2) * loud[:, 1:2]
         # Where the ray is most likely met: by what was believed, and by the size.
-        believed = torch.linalg.inv(P[:, :3, :3])
+        believed = torch.linalg.inv(P)
         Pd = (believed @ d[:, :, None])[:, :, 0]
         weight = (Pd * d).sum(dim=1, keepdim=True)
-        at = (Pd * (x[:, :3] - look.view.origin)).sum(dim=1, keepdim=True)
+        at = (Pd * (place - look.view.origin)).sum(dim=1, keepdim=True)
         size_weight = 1.0 / (share_var * look.by_size**2)
         depth = (at + size_weight * look.by_size) / (weight + size_weight)
         depth = depth.clamp(MIN_DEPTH_M, MAX_DEPTH_M).detach()

@@ -105,6 +105,8 @@ class Shape:
         slopes: Cameras whose eyes tell slopes by image moments, see
             `hvs_suite.policies.belief.slope`. With any, the head may let the tool lean about the
             target.
+        offsets: Cameras whose pose is not exact, and of which the belief finds out how far off they
+            show a target.
     """
 
     cameras: Mapping[str, tuple[int, int]]
@@ -119,6 +121,7 @@ class Shape:
     reads_positions: bool = True
     reads_velocities: bool = True
     slopes: tuple[str, ...] = ()
+    offsets: tuple[str, ...] = ()
 
 
 MEMORY_SIZE = BELIEF_SIZE + 2 * N_JOINTS + 1 + RECENT_SIZE
@@ -179,7 +182,7 @@ class BeliefNetwork(nn.Module):
                 for n, (c, side) in shape.cameras.items()
             }
         )
-        self.belief = Belief(cameras, cell.period_s)
+        self.belief = Belief(cameras, cell.period_s, offsets=shape.offsets)
         self.register_buffer("lowest_m", torch.tensor(-1.0))
         self.register_buffer(
             "joint_range", torch.tensor(JOINT_RANGE_RAD, dtype=torch.float32), persistent=False
@@ -280,9 +283,11 @@ class BeliefNetwork(nn.Module):
         """The memory at the beginning of an episode, (n, k) float64."""
         size = MEMORY_SIZE if self.residual is None else FELT.stop
         memory = torch.zeros(n, size, dtype=torch.float64)
-        memory[:, :BELIEF_SIZE] = self.belief.start(n)
+        believed = self.belief.start(n)
+        memory[:, :BELIEF_SIZE] = believed[:, :BELIEF_SIZE]
         memory[:, RECENT] = 1.0
-        return memory
+        # Offsets stand at the end, because not every network has them.
+        return torch.cat([memory, believed[:, BELIEF_SIZE:]], dim=1)
 
     def remember(
         self,
@@ -305,7 +310,9 @@ class BeliefNetwork(nn.Module):
         q = self._joints(memory, q)
         if views is None or not self.shape.reads_positions:
             views = self.views(geometry.flange_motion(q.double()))
-        believed, forget = self.belief(memory[:, :BELIEF_SIZE], sightings, views)
+        offsets = memory.shape[1] - (self.belief.size - BELIEF_SIZE)
+        before = torch.cat([memory[:, :BELIEF_SIZE], memory[:, offsets:]], dim=1)
+        believed, forget = self.belief(before, sightings, views)
         begun = memory[:, BEGUN] > 0
         set_point, trailing = (
             torch.where(begun, memory[:, part], q.double()) for part in (SET_POINT, TRAILING)
@@ -320,8 +327,9 @@ class BeliefNetwork(nn.Module):
         # Not seen since it was last forgotten: 1; falls to 0 when it is seen.
         unseen = torch.maximum(recent[:, :2], forget) * (1.0 - seen)
         away = (1.0 - seen) * (recent[:, 2:] * 0.9 + 0.1)
-        parts = [believed, set_point, trailing, torch.ones_like(set_point[:, :1]), unseen, away]
-        return torch.cat([*parts, memory[:, MEMORY_SIZE:]], dim=1)
+        parts = [believed[:, :BELIEF_SIZE], set_point, trailing, torch.ones_like(set_point[:, :1])]
+        parts += [unseen, away, memory[:, MEMORY_SIZE:offsets], believed[:, BELIEF_SIZE:]]
+        return torch.cat(parts, dim=1)
 
     def feel(
         self,
@@ -349,15 +357,13 @@ class BeliefNetwork(nn.Module):
             memory[:, FELT], place.here.position, place.sent.position, felt
         )
         goal, axes = self.goal_frame(memory)
-        return torch.cat([memory[:, :MEMORY_SIZE], part], dim=1), self.residual.inputs(
-            part, read, goal, axes
-        )
+        return _with_felt(memory, part), self.residual.inputs(part, read, goal, axes)
 
     def move_goal(self, memory: Tensor, share: Tensor) -> Tensor:
         """Move the goal by a share (B, 3) of the residual's largest step; after `feel`."""
         assert self.residual is not None
         part = self.residual.move(memory[:, FELT], share, *self.goal_frame(memory))
-        return torch.cat([memory[:, :MEMORY_SIZE], part], dim=1)
+        return _with_felt(memory, part)
 
     def goal_frame(self, memory: Tensor) -> tuple[Tensor, Tensor]:
         """Where the goal is believed to be, not moved (B, 3) m, and its axes (B, 3, 3), float64."""
@@ -594,6 +600,11 @@ class BeliefNetwork(nn.Module):
         """Inverse of `to_action` without the clipping: what the head should have said, (B, 7)."""
         step = action * self.joint_range - memory[:, SET_POINT].float()
         return torch.asinh(step / self.shape.error_scale)
+
+
+def _with_felt(memory: Tensor, part: Tensor) -> Tensor:
+    """A memory (B, k) with what the residual remembers replaced."""
+    return torch.cat([memory[:, :MEMORY_SIZE], part, memory[:, FELT.stop :]], dim=1)
 
 
 def _leaning(normal: Tensor, lean: Tensor) -> Tensor:

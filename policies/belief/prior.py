@@ -47,6 +47,10 @@ def fit_prior(
     to frame and of the slopes n_xy / n_z, the covariance `WIDER`; a camera's size is the median of
     apparent diameter times depth.
 
+    How far off a camera shows a target is the vector from the target to the nearest point of its
+    nominal ray. Its covariance is about zero, and its drift twice the covariance about the
+    episode's mean: the difference between two targets of an episode.
+
     Args:
         columns: ``privileged.goal_position`` and ``privileged.goal_normal`` (n, 3),
             ``observation.state`` (n, 14), ``privileged.target_<camera>`` (n, 4) of each camera of
@@ -75,6 +79,7 @@ def fit_prior(
     change = velocity.diff(dim=0)[episode.diff() == 0] / period_s
     covariance[ACCELERATION, ACCELERATION] = WIDER * change.T @ change / max(1, len(change))
     floors = torch.tensor([PLACE_FLOOR_M] * 3 + [MOTION_FLOOR] * 6, dtype=torch.float64)
+    offsets = {n: _offset(place, targets[n], view, episode) for n, view in views.items()}
     slope = normal[:, :2] / normal[:, 2:]
     spread = (slope - slope.mean(dim=0)).square().mean()
     return Prior(
@@ -84,6 +89,8 @@ def fit_prior(
         slope_variance=float(WIDER * spread + SLOPE_VARIANCE_FLOOR),
         standoff_m=standoff,
         sizes={name: _size(place, targets[name], view) for name, view in views.items()},
+        offsets={name: off[0] for name, off in offsets.items()},
+        drifts={name: off[1] for name, off in offsets.items()},
     )
 
 
@@ -101,9 +108,7 @@ def take_prior(network: BeliefNetwork, columns: Mapping[str, npt.NDArray[np.gene
 
 def _standoff(goal: Tensor, normal: Tensor, target: Tensor, view: View) -> float:
     seen = _in_view(target)
-    uv = target[seen, :2] * view.tan
-    ray = torch.cat([uv, torch.ones_like(uv[:, :1])], dim=1)
-    direction = (view.rotation[seen] @ (ray / ray.norm(dim=1, keepdim=True))[:, :, None])[:, :, 0]
+    direction = _rays(target, view)[seen]
     n, offset = normal[seen], goal[seen] - view.origin[seen]
     across = n - (n * direction).sum(dim=1, keepdim=True) * direction  # A n
     weight = 1.0 / offset.square().sum(dim=1)
@@ -117,6 +122,30 @@ def _size(place: Tensor, target: Tensor, view: View) -> float:
         return UNSEEN_SIZE
     depth = (view.rotation.transpose(1, 2) @ (place - view.origin)[:, :, None])[:, 2, 0]
     return float((target[:, 2] * depth)[seen].median())
+
+
+def _offset(place: Tensor, target: Tensor, view: View, episode: Tensor) -> tuple[Tensor, Tensor]:
+    """Covariance (3, 3) of how far off a camera shows targets, and of its changes."""
+    seen = _in_view(target)
+    direction, way = _rays(target, view)[seen], (place - view.origin)[seen]
+    off = (way * direction).sum(dim=1, keepdim=True) * direction - way
+    floor = PLACE_FLOOR_M**2 * torch.eye(3, dtype=off.dtype)
+    if len(off) == 0:
+        return floor, floor
+    episode = episode[seen]
+    n = torch.zeros(int(episode.max()) + 1, dtype=off.dtype).index_add(
+        0, episode, torch.ones_like(off[:, 0])
+    )
+    mean = torch.zeros(len(n), 3, dtype=off.dtype).index_add(0, episode, off)
+    change = off - (mean / n.clamp(min=1.0)[:, None])[episode]
+    return off.T @ off / len(off) + floor, 2.0 * change.T @ change / len(off) + floor
+
+
+def _rays(target: Tensor, view: View) -> Tensor:
+    """Unit vectors to where a camera shows targets, (n, 3)."""
+    uv = target[:, :2] * view.tan
+    ray = torch.cat([uv, torch.ones_like(uv[:, :1])], dim=1)
+    return (view.rotation @ (ray / ray.norm(dim=1, keepdim=True))[:, :, None])[:, :, 0]
 
 
 def _in_view(target: Tensor) -> Tensor:

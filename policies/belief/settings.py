@@ -90,6 +90,7 @@ class Settings(pydantic.BaseModel):
         reads_positions: See `Shape`.
         reads_velocities: See `Shape`.
         slopes: See `Shape`.
+        offsets: See `Shape`.
     """
 
     model_config = pydantic.ConfigDict(extra="ignore")
@@ -110,6 +111,7 @@ class Settings(pydantic.BaseModel):
     reads_positions: Annotated[bool, pydantic.Field(strict=True)] = True
     reads_velocities: Annotated[bool, pydantic.Field(strict=True)] = True
     slopes: tuple[Literal["eih", "eth"], ...] = ()
+    offsets: tuple[Literal["eih", "eth"], ...] = ()
 
     @pydantic.model_validator(mode="after")
     def _fit(self) -> "Settings":
@@ -163,6 +165,7 @@ class Settings(pydantic.BaseModel):
             reads_positions=self.reads_positions,
             reads_velocities=self.reads_velocities,
             slopes=self.slopes,
+            offsets=self.offsets,
         )
 
     def network(self) -> BeliefNetwork:

@@ -51,6 +51,7 @@ class Settings:
         windows: Windows of control steps a step that belief and head learn from.
         window_steps: Length of each.
         slopes: Cameras whose eyes tell the slope of the surface by image moments.
+        offsets: Cameras whose pose is not exact: how far off they show a target is found out.
     """
 
     seed: int = 0
@@ -69,6 +70,7 @@ class Settings:
     windows: int = 48
     window_steps: int = 16
     slopes: tuple[str, ...] = ()
+    offsets: tuple[str, ...] = ()
 
     def reads(self, name: str) -> bool:
         """Whether the policy is given an input."""
@@ -86,7 +88,7 @@ class Settings:
         if unknown := sorted({*(self.inputs or ())} - {*INPUTS}):
             raise OptionError(f"unknown input {unknown[0]!r}; choose from {', '.join(INPUTS)}")
         cameras = [name for name in manifest.cameras if self.reads(name)]
-        if unknown := sorted({*self.slopes} - {*cameras}):
+        if unknown := sorted({*self.slopes, *self.offsets} - {*cameras}):
             raise OptionError(f"unknown camera {unknown[0]!r}; choose from {', '.join(cameras)}")
         for name in ("batch_size", "dagger_frames", "windows", "window_steps"):
             if getattr(self, name) < 1:
@@ -171,6 +173,7 @@ def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":
         reads_positions=settings.reads("joint_positions"),
         reads_velocities=settings.reads("joint_velocities"),
         slopes=settings.slopes,
+        offsets=settings.offsets,
         **trained_for(task).model_dump(),
     )
     # torch initialises weights from its global generator; leave that as it was found.

@@ -36,8 +36,9 @@ DEEP = torch.tensor(
 )
 
 
-def make_belief(variances: torch.Tensor = FLAT) -> Belief:
-    belief = Belief(("eih",), PERIOD_S).eval()
+def make_belief(variances: torch.Tensor = FLAT, offsets: tuple[str, ...] = ()) -> Belief:
+    cameras = ("eih", *offsets)
+    belief = Belief(cameras, PERIOD_S, offsets=offsets).eval()
     belief.set_prior(
         Prior(
             place=torch.zeros(3, dtype=torch.float64),
@@ -45,7 +46,9 @@ def make_belief(variances: torch.Tensor = FLAT) -> Belief:
             slope=torch.zeros(2, dtype=torch.float64),
             slope_variance=0.01,
             standoff_m=0.05,
-            sizes={"eih": SIZE},
+            sizes=dict.fromkeys(cameras, SIZE),
+            offsets=dict.fromkeys(cameras, 9e-4 * torch.eye(3, dtype=torch.float64)),
+            drifts=dict.fromkeys(cameras, 1e-6 * torch.eye(3, dtype=torch.float64)),
         )
     )
     return belief
@@ -158,6 +161,32 @@ def test_the_covariance_stays_one_over_a_long_episode() -> None:
     np.testing.assert_allclose(P, P.T)
     assert torch.linalg.eigvalsh(P).min() > 0.0
     np.testing.assert_allclose(now[0, PLACE], [0.01, 0.02, 0.0], atol=1e-3)
+
+
+def test_how_far_off_a_camera_shows_one_target_is_known_of_the_next() -> None:
+    belief = make_belief(offsets=("eth",))
+    far, near = from_above((0.0, 0.0, 2.0)), from_above((0.2, 0.1, 0.2))
+    off = np.array([0.03, -0.02, 0.0])
+    first, second = np.array([0.2, 0.1, 0.0]), np.array([-0.2, 0.0, 0.0])
+
+    def look(now: torch.Tensor, target: np.ndarray, visible: float) -> torch.Tensor:
+        sightings = {"eih": seen(near, tuple(target), visible=visible)}
+        sightings["eth"] = seen(far, tuple(target + off), sigma_size=3.0)
+        with torch.no_grad():
+            return belief(now, sightings, {"eih": near, "eth": far})[0]
+
+    # The eye to hand alone: where it shows the target, and that this may be wrong.
+    now = look(belief.start(1), first, -15.0)
+    np.testing.assert_allclose(now[0, PLACE], first + off, atol=5e-3)
+    assert now[0, COVARIANCE].view(N_MOTION, N_MOTION)[0, 0].sqrt() > 0.02
+    for _ in range(3):
+        now = look(now, first, 12.0)
+    np.testing.assert_allclose(now[0, PLACE], first, atol=2e-3)
+    # The first target is forgotten, how far off the eye to hand shows it is not.
+    torch.nn.init.constant_(belief.gate[-1].bias[-4:-3], 30.0)
+    now = look(now, second, -15.0)
+    np.testing.assert_allclose(now[0, PLACE], second, atol=5e-3)
+    assert now[0, COVARIANCE].view(N_MOTION, N_MOTION)[0, 0].sqrt() < 0.01
 
 
 @pytest.mark.parametrize("off", [PLACE, TILT])
