@@ -272,10 +272,11 @@ class Belief(nn.Module):
         x, P = belief[:, MOTION], belief[:, COVARIANCE].view(n, N_MOTION, N_MOTION)
         if not off:
             return x, P
-        offsets, both, own = belief[:, BELIEF_SIZE:].split([off, N_MOTION * off, off * off], dim=1)
-        both = both.view(n, N_MOTION, off)
+        rest = belief[:, BELIEF_SIZE:]
+        offsets, own = rest[:, :off], rest[:, -off * off :].reshape(n, off, off)
+        both = rest[:, off : -off * off].reshape(n, N_MOTION, off)
         upper = torch.cat([P, both], dim=2)
-        lower = torch.cat([both.transpose(1, 2), own.view(n, off, off)], dim=2)
+        lower = torch.cat([both.transpose(1, 2), own], dim=2)
         return torch.cat([x, offsets], dim=1), torch.cat([upper, lower], dim=1)
 
     def _anew(self, x: Tensor, P: Tensor) -> tuple[Tensor, Tensor]:

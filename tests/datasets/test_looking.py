@@ -9,7 +9,7 @@ from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.cell.robot import JOINT_SPEED_RAD_S
 from hvs_suite.datasets.expert import Expert
 from hvs_suite.datasets.leaning import on_spiral
-from hvs_suite.datasets.looking import Demonstrator
+from hvs_suite.datasets.looking import CLEARANCE_M, Demonstrator
 from hvs_suite.tasks.shared.goal import Goal, Tip
 from hvs_suite.tasks.shared.placing import is_reachable
 
@@ -84,6 +84,30 @@ def test_where_the_far_camera_may_be_off_the_hand_looks_before_it_comes_down(tas
     # Now and then the arm starts lower than that.
     assert np.mean(np.array(heights_m) > 0.1) > 0.85
     assert len(heights_m) == 30
+
+
+def test_the_first_target_shows_how_far_off_the_far_camera_is_and_the_next_needs_no_look():
+    as_expert = {"first": [], "later": []}
+    with hvs_suite.load("sequence-hard", split="train", observations="state") as env:
+        demonstrator = Demonstrator(env)
+        expert = Expert(env, plain=True, clearance_m=CLEARANCE_M)
+        for scenario in range(4):
+            time_step = env.reset(scenario=scenario)
+            demonstrator.reset()
+            target, which = env.goal().target, "first"
+            while not time_step.last():
+                if (env.goal().target != target).any():
+                    target, which = env.goal().target, "later"
+                    if not is_hidden(env):
+                        same = np.array_equal(demonstrator.label(), expert.label())
+                        as_expert[which].append(same)
+                elif which == "first" and env.privileged()["target_eih"][3] < 0.5:
+                    same = np.array_equal(demonstrator.label(), expert.label())
+                    as_expert[which].append(same)
+                time_step = env.step(demonstrator.select_action({}))
+    assert len(as_expert["later"]) > 10
+    assert all(as_expert["later"])
+    assert np.mean(as_expert["first"]) < 0.5
 
 
 @pytest.mark.parametrize("task", ["align-hard", "align-limit"])

@@ -185,6 +185,19 @@ def test_eyes_of_chosen_cameras_tell_slopes_by_moments(dataset, tmp_path):
         pretrain(dataset, tmp_path / "other", inputs=("eth",), slopes=("eih",), **STEP)
 
 
+def test_how_far_off_a_camera_is_can_be_part_of_the_belief(dataset, tmp_path):
+    pretrain(dataset, tmp_path / "out", offsets=("eth",), **STEP)
+    assert json.loads((tmp_path / "out/config.json").read_text())["offsets"] == ["eth"]
+    network = load_network(tmp_path / "out")
+    image = torch.rand(1, 3, 28, 28, generator=torch.Generator().manual_seed(0))
+    compiled = CompiledBelief(network)
+    images, state = {"eih": image, "eth": image}, torch.zeros(1, 14)
+    slow, _ = act(network, images, state, network.start(1))
+    torch.testing.assert_close(compiled(images, state, None)[0], slow, atol=1e-6, rtol=0)
+    with pytest.raises(OptionError, match="unknown camera 'top'"):
+        pretrain(dataset, tmp_path / "other", offsets=("top",), **STEP)
+
+
 def test_errors_weigh_by_the_tolerance_unless_told_otherwise(dataset, tmp_path):
     scales = []
     for name, options in (("a", {}), ("b", {"error_scale": 0.5})):

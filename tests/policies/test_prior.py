@@ -55,6 +55,23 @@ def test_rays_say_how_far_the_goal_is_from_the_target(standoff_m: float) -> None
     assert torch.linalg.eigvalsh(prior.covariance).min() > 0.0
 
 
+def test_a_camera_that_is_not_where_it_should_be_is_off_by_as_much() -> None:
+    columns, views = looks(200, 0.05)
+    exact = fit_prior(columns, views, PERIOD_S)
+    assert exact.offsets["eih"].max() < 1e-8
+    # Elsewhere in each episode, and level all the time: the view is along z but for some degrees.
+    moved = np.random.default_rng(1).normal(0.0, 0.02, (20, 3))[columns["episode_index"]]
+    moved[:, 2] = 0.0
+    view = views["eih"]
+    nominal = View(view.origin + torch.from_numpy(moved), view.rotation, view.tan)
+    off = fit_prior(columns, {"eih": nominal}, PERIOD_S)
+    spread = np.diag(off.offsets["eih"])
+    np.testing.assert_allclose(spread[:2], np.mean(moved[:, :2] ** 2, axis=0), rtol=0.2)
+    assert spread[2] < 0.1 * spread[:2].min()
+    # It stays there in an episode, so little of that changes from one target to the next.
+    assert np.diag(off.drifts["eih"])[:2].max() < 0.1 * spread[:2].min()
+
+
 def test_a_target_that_nobody_sees_has_its_goals_for_a_prior() -> None:
     columns, views = looks(50, 0.05)
     columns["privileged.target_eih"][:, 3] = 0.0
