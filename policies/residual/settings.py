@@ -1,4 +1,4 @@
-"""Settings of fine-tuning, and what they were chosen for."""
+"""Settings of fine-tuning; the defaults are those of the weights that are shipped."""
 
 import dataclasses
 import math
@@ -38,7 +38,7 @@ class Settings:
         environments: How many play, in processes of their own; a single one in the learner's.
     """
 
-    sideways_m: float = 0.0004
+    sideways_m: float = 0.0008
     along_m: float = 0.001
     reach_m: float = 0.02
     hidden: int = 128
@@ -49,9 +49,9 @@ class Settings:
     actor_tau: float = 0.005
     gamma: float = 0.98
     replay_size: int = 100_000
-    warm_up_steps: int = 4_000
-    updates: int = 1
-    noise: float = 0.35
+    warm_up_steps: int = 3_000
+    updates: int = 2
+    noise: float = 0.25
     noise_along: float = 0.1
     noise_decay: float = 0.3
     target_noise: float = 0.1

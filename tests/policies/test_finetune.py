@@ -36,7 +36,13 @@ TASK = "insert-feel"
 OPTIONS = {"time_limit_steps": 3}
 # What has learned nothing comes near no goal: it acts wherever it is.
 SMALL = Settings(
-    batch_size=4, replay_size=12, warm_up_steps=4, hidden=16, environments=1, reach_m=10.0
+    batch_size=4,
+    replay_size=12,
+    warm_up_steps=4,
+    updates=1,
+    hidden=16,
+    environments=1,
+    reach_m=10.0,
 )
 CALL = {
     "options": OPTIONS, "settings": SMALL, "eval_every": 1000, "eval_episodes": 1,
