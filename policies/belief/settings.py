@@ -132,6 +132,8 @@ class Settings(pydantic.BaseModel):
                 raise ValueError(f"{key[:80]} must have shape {shape}, not {self._shape(key)}")
         if further := sorted(self.input_features.keys() - wanted.keys()):
             raise ValueError(f"it has no use for {further[0][:80]!r}")
+        if missing := sorted({*self.slopes, *self.offsets} - {*cameras}):
+            raise ValueError(f"it has no camera {missing[0]!r}")
         if self.cell.period_s != self.control_period_s:
             raise ValueError(
                 f"the cell has control steps of {self.cell.period_s:g} s, the policy of "

@@ -196,6 +196,11 @@ def test_how_far_off_a_camera_is_can_be_part_of_the_belief(dataset, tmp_path):
     torch.testing.assert_close(compiled(images, state, None)[0], slow, atol=1e-6, rtol=0)
     with pytest.raises(OptionError, match="unknown camera 'top'"):
         pretrain(dataset, tmp_path / "other", offsets=("top",), **STEP)
+    config = json.loads((tmp_path / "out/config.json").read_text())
+    del config["input_features"]["observation.images.eth"]
+    (tmp_path / "out/config.json").write_text(json.dumps(config))
+    with pytest.raises(PolicyError, match="it has no camera 'eth'"):
+        load_network(tmp_path / "out")
 
 
 def test_errors_weigh_by_the_tolerance_unless_told_otherwise(dataset, tmp_path):

@@ -269,6 +269,8 @@ DAMAGES: dict[str, Damage] = {
             "hidden": [None, 2**31, 4096],
             "error_scale": [None, "small", 0, -1.0],
             "residual_hidden": [None, -3, 2**40, 64],
+            "slopes": [None, ["top"], ["eih"]],
+            "offsets": [None, ["top"], ["eth"], ["eth", "eth"]],
         }.items()
         for value in values
     },
