@@ -167,18 +167,23 @@ def test_a_policy_may_see_grey_where_the_dataset_has_colour(dataset, tmp_path):
         pretrain(dataset, tmp_path / "other", inputs=("top",), **STEP)
 
 
+def check_compiled(folder):
+    """What plays a policy fast decides as the policy does."""
+    network = load_network(folder)
+    image = torch.rand(1, 3, 28, 28, generator=torch.Generator().manual_seed(0))
+    images, state = {"eih": image, "eth": image}, torch.zeros(1, 14)
+    slow, _ = act(network, images, state, network.start(1))
+    fast, _ = CompiledBelief(network)(images, state, None)
+    torch.testing.assert_close(fast, slow, atol=1e-6, rtol=0)
+
+
 def test_eyes_of_chosen_cameras_tell_slopes_by_moments(dataset, tmp_path):
     pretrain(dataset, tmp_path / "out", slopes=("eih",), **STEP)
     assert json.loads((tmp_path / "out/config.json").read_text())["slopes"] == ["eih"]
     moments = [name for name in weights(tmp_path / "out") if name.endswith(".slope.mean")]
     assert len(moments) == 1
     assert ".eih." in moments[0]
-    network = load_network(tmp_path / "out")
-    image = torch.rand(1, 3, 28, 28, generator=torch.Generator().manual_seed(0))
-    compiled = CompiledBelief(network)
-    images, state = {"eih": image, "eth": image}, torch.zeros(1, 14)
-    slow, _ = act(network, images, state, network.start(1))
-    torch.testing.assert_close(compiled(images, state, None)[0], slow, atol=1e-6, rtol=0)
+    check_compiled(tmp_path / "out")
     with pytest.raises(OptionError, match="unknown camera 'top'"):
         pretrain(dataset, tmp_path / "other", slopes=("top",), **STEP)
     with pytest.raises(OptionError, match="unknown camera 'eih'; choose from eth"):
@@ -188,12 +193,7 @@ def test_eyes_of_chosen_cameras_tell_slopes_by_moments(dataset, tmp_path):
 def test_how_far_off_a_camera_is_can_be_part_of_the_belief(dataset, tmp_path):
     pretrain(dataset, tmp_path / "out", offsets=("eth",), **STEP)
     assert json.loads((tmp_path / "out/config.json").read_text())["offsets"] == ["eth"]
-    network = load_network(tmp_path / "out")
-    image = torch.rand(1, 3, 28, 28, generator=torch.Generator().manual_seed(0))
-    compiled = CompiledBelief(network)
-    images, state = {"eih": image, "eth": image}, torch.zeros(1, 14)
-    slow, _ = act(network, images, state, network.start(1))
-    torch.testing.assert_close(compiled(images, state, None)[0], slow, atol=1e-6, rtol=0)
+    check_compiled(tmp_path / "out")
     with pytest.raises(OptionError, match="unknown camera 'top'"):
         pretrain(dataset, tmp_path / "other", offsets=("top",), **STEP)
     config = json.loads((tmp_path / "out/config.json").read_text())
