@@ -24,8 +24,10 @@ from hvs_suite.datasets.features import (
     observed_part,
 )
 from hvs_suite.datasets.png import encode
+from hvs_suite.datasets.swaying import SwayingDemonstrator
 from hvs_suite.registry import load
 from hvs_suite.rollout import Policy, overrule, tell
+from hvs_suite.tasks.shared.panels import PanelSpec
 
 if TYPE_CHECKING:
     from hvs_suite.tasks.shared.environment import Environment, Moment
@@ -100,7 +102,8 @@ class Demonstrate:
 
     Attributes:
         noise: Standard deviation of the perturbation of the executed joint targets, far from the
-            goal (rad); 0 executes what the demonstrator says.
+            goal (rad); 0 executes what the demonstrator says. With any, it also goes astray over
+            surfaces of unknown slope, see `hvs_suite.datasets.swaying`.
         looks: Whether the demonstrator needs the pictures to decide.
     """
 
@@ -115,6 +118,9 @@ class Demonstrate:
         tell(policy, env)
         policy.reset()
         perturbation = _Perturbation(env, scenario, self.noise) if self.noise > 0.0 else None
+        astray = None
+        if perturbation is not None and isinstance(env.spec, PanelSpec) and not self.looks:
+            astray = SwayingDemonstrator(env, scenario)
         frames: list[Frame] = []
         moments: list[Moment] = []
         while not time_step.last():
@@ -126,7 +132,9 @@ class Demonstrate:
                 action = np.clip(action, -1.0, 1.0).astype(np.float32)
             executed = action
             if perturbation is not None:
-                executed = perturbation.apply(action)
+                if astray is not None and not astray.is_over:
+                    executed = astray.label()
+                executed = perturbation.apply(executed)
                 overrule(policy, executed)
             time_step = env.step(executed)
             frame |= acted_part(

@@ -44,7 +44,7 @@ def on_spiral(goal: Goal, tip: Tip) -> tuple[Goal, bool]:
     share = min((left_m - AHEAD_M) / RANGE_M, 1.0)
     if share <= 0.0:
         return goal, True
-    x, y = _axes(goal.normal)
+    x, y = axes_across(goal.normal)
     turned = 2.0 * math.pi * TURNS * share
     side = math.cos(turned) * x + math.sin(turned) * y
     for most in LEANS_RAD:
@@ -59,7 +59,7 @@ def on_spiral(goal: Goal, tip: Tip) -> tuple[Goal, bool]:
     return goal, share < 1.0
 
 
-def _axes(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
+def axes_across(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The base frame's x and y axes, laid into the plane across a normal (3,)."""
     x = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
     x /= np.linalg.norm(x)

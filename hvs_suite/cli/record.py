@@ -28,7 +28,8 @@ class Record(Players):
         start: Where the arm starts, if not where the task says; mixed starts half of the episodes
             near the goal.
         noise: Standard deviation of a disturbance of the executed joint targets, far from the goal
-            (rad); the demonstrator's own action stays the label.
+            (rad); the demonstrator's own action stays the label. Over surfaces of unknown slope the
+            expert also goes astray near the goal, for a time.
         policy: What demonstrates: expert, servo, a checkpoint folder, or code of your own as
             module:factory, whose factory gets the environment and may know what is true.
         option: Parameter of the task to change for a study, such as target_diameter_m=0.03; give it
