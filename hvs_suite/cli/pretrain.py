@@ -45,11 +45,14 @@ class Pretrain(Players):
             find: a checkpoint folder, or a named task for the weights shipped for it.
         windows: Windows of control steps that belief and head learn from in a step.
         window_steps: Length of each.
+        eye_share: Part of the training in which the eyes learn; in the rest belief and head do,
+            from what the eyes see. With 1 nothing but eyes comes out, for --eyes of another run.
         slopes: Cameras whose eyes tell the slope of the surface by image moments, joined by +; for
             surfaces that lean.
         offsets: Cameras whose pose is not exact, joined by +: the belief finds out how far off they
             show a target; for targets in sequence.
         batch_size: Frames that the eyes learn from in a step.
+        device: Where the eyes learn: cpu or cuda. The rest learns on the processor.
         learning_rate: Peak of the schedule.
         seed: Seed of the initial weights, the held-out episodes and the order.
     """
@@ -68,9 +71,11 @@ class Pretrain(Players):
     eyes: str | None = None
     windows: int = 48
     window_steps: int = 16
+    eye_share: float = 0.5
     slopes: str | None = None
     offsets: str | None = None
     batch_size: int = 64
+    device: str = "cpu"
     learning_rate: float = 2e-3
     seed: int = 0
 
@@ -97,11 +102,13 @@ class Pretrain(Players):
                 eyes=None if self.eyes is None else _folder(self.eyes),
                 windows=self.windows,
                 window_steps=self.window_steps,
+                eye_share=self.eye_share,
                 slopes=() if self.slopes is None else tuple(self.slopes.split("+")),
                 offsets=() if self.offsets is None else tuple(self.offsets.split("+")),
                 batch_size=self.batch_size,
                 learning_rate=self.learning_rate,
                 workers=self.players(local=2),
+                device=self.device,
                 seed=self.seed,
                 on_progress=lambda state: update(state.stage, state.share, _words(state)),
             )

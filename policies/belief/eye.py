@@ -274,12 +274,12 @@ def sighting_loss(seen: Seen, truth: Tensor, normal: Tensor) -> tuple[Tensor, di
         "size": mean(
             F.smooth_l1_loss(size_off, torch.zeros_like(size_off), beta=0.05, reduction="none")
         ),
-        "sigma_uv": 0.1 * mean(_doubt(off.detach(), sighting[:, LOG_SIGMA_UV])),
-        "sigma_size": 0.1 * mean(_doubt(size_off.detach(), sighting[:, LOG_SIGMA_SIZE])),
+        "sigma_uv": 0.1 * mean(doubt(off.detach(), sighting[:, LOG_SIGMA_UV])),
+        "sigma_size": 0.1 * mean(doubt(size_off.detach(), sighting[:, LOG_SIGMA_SIZE])),
         "slope": mean(
             F.smooth_l1_loss(slope_off, torch.zeros_like(slope_off), beta=0.02, reduction="none")
         ),
-        "sigma_slope": 0.1 * mean(_doubt(slope_off.detach(), sighting[:, LOG_SIGMA_SLOPE])),
+        "sigma_slope": 0.1 * mean(doubt(slope_off.detach(), sighting[:, LOG_SIGMA_SLOPE])),
         "visible": 0.3 * F.binary_cross_entropy_with_logits(sighting[:, VISIBLE], visible),
     }
     return sum(parts.values(), torch.zeros(())), parts
@@ -300,10 +300,17 @@ def _hill(place: Tensor, n: int) -> Tensor:
     return torch.softmax(-0.5 * (off / MAP_SIGMA_CELLS) ** 2, dim=1)
 
 
-def _doubt(error: Tensor, log_sigma: Tensor) -> Tensor:
+def doubt(error: Tensor, log_sigma: Tensor) -> Tensor:
     """Negative log-likelihood under Student's t with four degrees of freedom, summed over axes.
 
     Its long tails keep the few gross errors from drowning the rest.
+
+    Args:
+        error: (B, n).
+        log_sigma: Logarithm of the standard deviation that was told, (B, 1).
+
+    Returns:
+        (B, 1).
     """
     log_sigma = log_sigma.clamp(-8.0, 2.0)
     n = error.shape[1]

@@ -56,7 +56,7 @@ def eye_lesson(
 
     Args:
         network: Knows where the cameras are.
-        seen: By camera name.
+        seen: By camera name, where the eyes are.
         q: Measured joint positions, (B, 7) rad.
         truth: Of the frames.
 
@@ -64,11 +64,31 @@ def eye_lesson(
         Scalar, and the loss of each eye.
     """
     parts = {}
-    for name, view in network.views(geometry.flange_motion(q.double())).items():
-        facing = view.rotation.transpose(1, 2) @ truth.goal_normal.double()[:, :, None]
-        loss, _ = sighting_loss(seen[name], truth.targets[name], facing[:, :2, 0].float())
+    device = network.eyes_device
+    for name, normal in facing(network, q, truth).items():
+        target = truth.targets[name].to(device)
+        loss, _ = sighting_loss(seen[name], target, normal.to(device))
         parts[f"{name}_loss"] = loss
     return torch.stack(list(parts.values())).sum(), parts
+
+
+def facing(network: BeliefNetwork, q: Tensor, truth: Recorded) -> dict[str, Tensor]:
+    """How the targets face the cameras: what eyes should say of the slope.
+
+    Args:
+        network: Knows where the cameras are.
+        q: Measured joint positions, (B, 7) rad.
+        truth: Of the frames.
+
+    Returns:
+        Camera name to x and y of the normal in its optical frame, (B, 2).
+    """
+    normal = truth.goal_normal.double()[:, :, None]
+    views = network.views(geometry.flange_motion(q.double()))
+    return {
+        name: (view.rotation.transpose(1, 2) @ normal)[:, :2, 0].float()
+        for name, view in views.items()
+    }
 
 
 def remembered(network: BeliefNetwork, window: Window) -> Tensor:

@@ -258,6 +258,11 @@ class BeliefNetwork(nn.Module):
                 views[name] = View(at.expand(n, 3), axes.expand(n, 3, 3), cell.tan[name])
         return views
 
+    @property
+    def eyes_device(self) -> torch.device:
+        """Where the eyes are; belief and head are on the processor."""
+        return next(self.eyes.parameters()).device
+
     def look(self, images: Mapping[str, Tensor], goal: Tensor | None = None) -> dict[str, Tensor]:
         """Run the eyes: camera name to sightings (B, 9)."""
         return {name: eye(images[name], goal) for name, eye in self.eyes.items()}

@@ -48,6 +48,21 @@ RECENT = 100
 """Batches over which means and spreads are averaged, about."""
 
 
+def new_judge(n_numbers: int) -> nn.Sequential:
+    """A fresh network from numbers to a slope and its doubt.
+
+    Args:
+        n_numbers: That it is given.
+    """
+    last = nn.Linear(HIDDEN // 2, SLOPE_SIZE)
+    nn.init.zeros_(last.weight)
+    with torch.no_grad():
+        last.bias.copy_(torch.tensor([0.0, 0.0, -1.0]))
+    return nn.Sequential(
+        nn.Linear(n_numbers, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, HIDDEN // 2), nn.SiLU(), last
+    )
+
+
 class SlopeEye(nn.Module):
     """Says how a surface faces the camera.
 
@@ -69,13 +84,7 @@ class SlopeEye(nn.Module):
         self.register_buffer("mean", torch.zeros(n))
         self.register_buffer("variance", torch.ones(n))
         self.register_buffer("n_batches", torch.tensor(0.0))
-        last = nn.Linear(HIDDEN // 2, SLOPE_SIZE)
-        nn.init.zeros_(last.weight)
-        with torch.no_grad():
-            last.bias.copy_(torch.tensor([0.0, 0.0, -1.0]))
-        self.judge = nn.Sequential(
-            nn.Linear(n + 3, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, HIDDEN // 2), nn.SiLU(), last
-        )
+        self.judge = new_judge(n + 3)
         self._side, self._window = side, min(side, MOST_PX)
 
     def forward(self, images: Tensor, uv: Tensor, log_diameter: Tensor, counts: Tensor) -> Tensor:

@@ -40,7 +40,7 @@ from hvs_suite.policies.training.budget import Budget
 from hvs_suite.policies.training.curves import Curves
 from hvs_suite.policies.training.dataset import Manifest, read_manifest, refuse_test_split
 from hvs_suite.policies.training.plot import draw_run
-from hvs_suite.policies.training.process import prepare_process
+from hvs_suite.policies.training.process import check_device, prepare_process
 from hvs_suite.policies.training.run_folder import claimed, write_train_config
 
 PACKAGES = ("hvs-suite", "lerobot", "numpy", "torch")
@@ -111,6 +111,7 @@ def pretrain(
     steps: int | None = None,
     eyes: Path | None = None,
     workers: Workers = 2,
+    device: str = "cpu",
     checkpoint_period_s: float = 60.0,
     on_progress: Callable[[Progress], None] | None = None,
     **settings: Any,
@@ -125,6 +126,8 @@ def pretrain(
         steps: Stop after this many optimiser steps. Give either, or both for the first reached.
         eyes: Checkpoint of a policy to take the eyes of, see `take_eyes`; None for fresh ones.
         workers: Processes that play the rounds, or others elsewhere; all give the same.
+        device: Where the eyes learn, as torch calls it. Belief and head, whose steps are many and
+            small, learn on the processor in any case.
         checkpoint_period_s: Time between checkpoints (s).
         on_progress: Called while decoding and after every step.
         **settings: Fields of `Settings` that differ from the defaults.
@@ -134,7 +137,7 @@ def pretrain(
 
     Raises:
         DatasetError: The dataset cannot be trained on, or was recorded on ``test``.
-        OptionError: No budget, or a number that makes no sense.
+        OptionError: No budget, a number that makes no sense, or a device that is not there.
         OutputError: ``out`` cannot be written, its disk is full, or it holds something else than
             this run. With room again, the same command goes on from the last checkpoint.
         PolicyError: The eyes do not fit.
@@ -142,6 +145,7 @@ def pretrain(
     """
     budget = Budget(steps, minutes)
     check_workers(workers)
+    check_device(device)
     manifest = read_manifest(data)
     refuse_test_split(manifest)
     chosen = settings_for(manifest, eyes, settings)
@@ -154,11 +158,13 @@ def pretrain(
         policy = new_policy(manifest, chosen)
         if eyes is not None:
             take_eyes(policy, eyes)
+        policy.network.eyes.to(device)
         write_train_config(
             out,
             identity,
             {"minutes": minutes, "steps": steps},
             PACKAGES,
+            device=device,
             data=str(data),
             options=dict(manifest.options),
             demonstrator=manifest.demonstrator,
@@ -272,8 +278,9 @@ class _Run:
                 step = self._counters.step
                 teacher.advance(share)
                 if teacher.is_due:
-                    self._checkpoint(teacher, optimizer, state, curves)
                     teacher.look_again()
+                    self._checkpoint(teacher, optimizer, state, curves)
+                    teacher.keep()
                 step_rate = rate * _schedule(share)
                 for group in optimizer.param_groups:
                     group["lr"] = step_rate
@@ -320,7 +327,7 @@ class _Run:
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         norms = [
-            torch.nn.utils.clip_grad_norm_(together, GRADIENT_NORM)
+            torch.nn.utils.clip_grad_norm_(together, GRADIENT_NORM).cpu()
             for together in teacher.clipped_apart()
         ]
         norm = torch.stack(norms).norm()

@@ -50,6 +50,8 @@ class Settings:
         eyes: SHA-256 of the weights whose eyes it begins with; None for fresh ones.
         windows: Windows of control steps a step that belief and head learn from.
         window_steps: Length of each.
+        eye_share: Part of the training in which the eyes learn, the others from what they see in
+            the rest. With 1 there is nothing but eyes, for another run to begin with.
         slopes: Cameras whose eyes tell the slope of the surface by image moments.
         offsets: Cameras whose pose is not exact: how far off they show a target is found out.
     """
@@ -69,6 +71,7 @@ class Settings:
     eyes: str | None = None
     windows: int = 48
     window_steps: int = 16
+    eye_share: float = 0.5
     slopes: tuple[str, ...] = ()
     offsets: tuple[str, ...] = ()
 
@@ -93,6 +96,10 @@ class Settings:
         for name in ("batch_size", "dagger_frames", "windows", "window_steps"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if not 0.0 < self.eye_share <= 1.0:
+            raise OptionError(f"eye_share must be above 0 and at most 1, not {self.eye_share}")
+        if self.eye_share == 1.0 and self.dagger_rounds:
+            raise OptionError("eyes alone cannot play; leave --dagger-rounds out, or --eye-share")
         if not 0.0 < self.learning_rate < 1.0:
             raise OptionError(f"learning_rate must be between 0 and 1, not {self.learning_rate}")
         if self.dagger_rounds < 0:

@@ -1,9 +1,9 @@
 """How the `hvs` network learns from demonstrations: its eyes from frames, the rest from windows.
 
 The training falls into parts, one more than there are DAgger rounds. In each of them the eyes learn
-first, as far as `EYE_SHARE` of it, from frames; then they look at all frames, and belief and head
-learn from windows of what they saw. So the belief learns of the errors that these very eyes make,
-and what plays the next round has eyes and a belief that know each other.
+first, from frames, for `Settings.eye_share` of it; then they look at all frames, and belief and
+head learn from windows of what they saw. So the belief learns of the errors that these very eyes
+make, and what plays the next round has eyes and a belief that know each other.
 """
 
 import bisect
@@ -29,8 +29,6 @@ from hvs_suite.policies.training.dataset import EPISODE
 if TYPE_CHECKING:
     from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
 
-EYE_SHARE = 0.5
-"""Of each part of the training: the eyes' own."""
 RECALL_SHARE = 0.05
 """How often the belief goes through all episodes again."""
 # Philox words that keep this stream apart from others of the same seed.
@@ -100,7 +98,7 @@ class Teacher:
         """Which part of the training this is, and whether it is the eyes' turn."""
         part = min(bisect.bisect_right(self._bounds, share) - 1, len(self._bounds) - 2)
         begin, end = self._bounds[part : part + 2]
-        return part, share < begin + EYE_SHARE * (end - begin)
+        return part, share < begin + self._settings.eye_share * (end - begin)
 
     def _reopen(self, share: float) -> None:
         """Go on with what a killed run saw last, if it has gone so far."""
@@ -112,7 +110,8 @@ class Teacher:
     def look_again(self) -> None:
         """Look at all frames once in each part of the training; recall all episodes.
 
-        This takes too long for every step; the result is a function of the weights.
+        This takes too long for every step; the result is a function of the weights. It may change
+        them, see `WindowPool.look`, so `keep` it once they are written.
         """
         network = self.policy.network
         self.policy.eval()
@@ -121,8 +120,11 @@ class Teacher:
         else:
             self._windows.recall(network)
         self.policy.train()
-        self._windows.keep(self._file, self._share)
         self._looked_in, self._due = self._at, _next_due(self._share)
+
+    def keep(self) -> None:
+        """Write what was seen, for a killed run to go on with."""
+        self._windows.keep(self._file, self._share)
 
     def lesson(self, rows: Rows, step: int) -> tuple[Tensor, Parts]:
         """Loss to learn from, and what it is made of.

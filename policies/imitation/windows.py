@@ -20,10 +20,11 @@ from hvs_suite.policies.belief.eye import (
     SLOPE,
     UV,
 )
-from hvs_suite.policies.belief.lessons import Window, remembered
-from hvs_suite.policies.belief.network import BeliefNetwork
+from hvs_suite.policies.belief.lessons import Window, facing, remembered
+from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
 from hvs_suite.policies.belief.recorded import Recorded, recorded
 from hvs_suite.policies.imitation.demonstrations import Demonstrations
+from hvs_suite.policies.imitation.slopes import Measured
 
 JITTER = 0.35
 """Eyes err more on pictures that they did not learn from: by so many of their own standard
@@ -62,27 +63,38 @@ class WindowPool:
     def look(self, network: BeliefNetwork) -> None:
         """Have the eyes look at every frame, and the belief go through every episode.
 
+        Eyes that tell slopes by image moments learn from those of all frames then.
+
         Args:
             network: In evaluation mode.
         """
         seen: dict[str, list[Tensor]] = {name: [] for name in network.shape.cameras}
-        with torch.no_grad():
+        with torch.no_grad(), Measured(network) as measured:
             for first in range(0, len(self._demonstrations), BATCH):
                 rows = np.arange(first, min(first + BATCH, len(self._demonstrations)))
                 batch = self._demonstrations.batch(rows)
                 for name, sighting in network.look(*self.pictures(network, batch)).items():
-                    seen[name].append(sighting)
+                    seen[name].append(sighting.cpu())
         self._sightings = {name: torch.cat(parts) for name, parts in seen.items()}
         self._memory = None
         self._open(network)
+        measured.fit(
+            self._sightings,
+            facing(network, self._columns[STATE][:, :N_JOINTS], self._truth),
+            {name: target[:, 3] > 0.0 for name, target in self._truth.targets.items()},
+            torch.from_numpy(self._demonstrations.training),
+        )
         self.recall(network)
 
     def pictures(
         self, network: BeliefNetwork, batch: Mapping[str, Tensor]
     ) -> tuple[dict[str, Tensor], Tensor | None]:
-        """What the eyes are given of a batch: images by camera, and which target is meant."""
-        images = {name: batch[f"observation.images.{name}"] for name in network.shape.cameras}
-        return images, None if self._goal_key is None else batch[self._goal_key]
+        """What the eyes are given of a batch, where they are: images, and which target is meant."""
+        device = network.eyes_device
+        images = {
+            name: batch[f"observation.images.{name}"].to(device) for name in network.shape.cameras
+        }
+        return images, None if self._goal_key is None else batch[self._goal_key].to(device)
 
     def _open(self, network: BeliefNetwork) -> None:
         """Take the columns of all frames into memory."""

@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
-import torch
 from gymnasium import spaces
 from stable_baselines3 import SAC
 
@@ -27,7 +26,7 @@ from hvs_suite.policies.sac.network import policy_kwargs
 from hvs_suite.policies.sac.playing import GreedyActor, save_actor, write_config
 from hvs_suite.policies.sac.settings import Settings
 from hvs_suite.policies.training.budget import Budget
-from hvs_suite.policies.training.process import prepare_process
+from hvs_suite.policies.training.process import check_device, prepare_process
 from hvs_suite.policies.training.run_folder import claimed, write_train_config
 from hvs_suite.registry import find, options_of
 from hvs_suite.rollout import library_seeds
@@ -201,8 +200,4 @@ def _check(spec: Spec, settings: Settings, device: str) -> None:
             f"the network reads {', '.join(INPUTS)}, and normalises them itself; leave out "
             f"{', '.join(others) or 'normalise_observation'}"
         )
-    try:
-        torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise OptionError(f"device {device!r} cannot be used: {reason}; use cpu") from error
+    check_device(device)

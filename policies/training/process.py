@@ -5,6 +5,8 @@ import sys
 
 import torch
 
+from hvs_suite.errors import OptionError
+
 # Numbers of glibc's malloc.h.
 _M_TRIM_THRESHOLD = -1
 _M_MMAP_MAX = -4
@@ -15,6 +17,22 @@ def prepare_process() -> None:
     """Settle what holds for every training run on a processor: two threads, memory that is kept."""
     _keep_freed_memory()
     torch.set_num_threads(min(2, torch.get_num_threads()))
+
+
+def check_device(name: str) -> None:
+    """Refuse a device that cannot be used.
+
+    Args:
+        name: As torch calls it: ``cpu``, ``cuda``, ``cuda:1``.
+
+    Raises:
+        OptionError: It is unknown or not there.
+    """
+    try:
+        torch.zeros(1, device=name)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise OptionError(f"device {name!r} cannot be used: {reason}; use cpu") from error
 
 
 def _keep_freed_memory() -> None:

@@ -190,6 +190,16 @@ def test_eyes_of_chosen_cameras_tell_slopes_by_moments(dataset, tmp_path):
         pretrain(dataset, tmp_path / "other", inputs=("eth",), slopes=("eih",), **STEP)
 
 
+def test_eyes_can_learn_alone(dataset, tmp_path):
+    options = {"batch_size": 4, "learning_rate": 1e-2, "seed": 0}
+    for name, steps in (("begun", 1), ("learned", 4)):
+        pretrain(dataset, tmp_path / name, steps=steps, eye_share=1.0, **options)
+    before, after = weights(tmp_path / "begun"), weights(tmp_path / "learned")
+    changed = {name for name in after if (after[name] != before[name]).any()}
+    assert changed
+    assert all(".eyes." in name for name in changed)
+
+
 def test_how_far_off_a_camera_is_can_be_part_of_the_belief(dataset, tmp_path):
     pretrain(dataset, tmp_path / "out", offsets=("eth",), **STEP)
     assert json.loads((tmp_path / "out/config.json").read_text())["offsets"] == ["eth"]
@@ -273,6 +283,9 @@ def test_a_run_with_other_settings_is_not_mixed_into(dataset, tmp_path):
         {"steps": 1, "error_scale": 0.0},
         {"steps": 1, "inputs": ("eih", "nose")},
         {"steps": 1, "inputs": ()},
+        {"steps": 1, "device": "abacus"},
+        {"steps": 1, "eye_share": 0.0},
+        {"steps": 1, "eye_share": 1.0, "dagger_rounds": 1},
     ],
 )
 def test_numbers_that_make_no_sense_are_refused(dataset, tmp_path, options):

@@ -22,6 +22,7 @@ from hvs_suite.registry import load
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "align-thesis"
 SMALL = {
+    "slopes": ("eih",),
     "batch_size": 8,
     "windows": 6,
     "window_steps": 6,
@@ -62,9 +63,10 @@ def test_a_run_learns_from_its_rounds_and_ends_in_a_checkpoint_that_plays(traine
     assert (first != second).any()
 
 
-def test_a_killed_run_ends_like_one_that_was_left_alone(trained, tmp_path):
+@pytest.mark.parametrize("step", [4, 9])  # just after the eyes looked at all frames, and later
+def test_a_killed_run_ends_like_one_that_was_left_alone(trained, tmp_path, step):
     def kill(progress):
-        if progress.stage == "training" and progress.step == 9:
+        if progress.stage == "training" and progress.step == step:
             raise Killed
 
     options = {"steps": 12, "dagger_rounds": 1, "dagger_frames": 24, **SMALL}

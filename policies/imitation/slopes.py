@@ -1,0 +1,110 @@
+"""Learning to tell slopes from the image moments of all frames at once.
+
+Taught together with all else that an eye learns, by some dozens of frames a step, what judges the
+moments stops at twice the error that a network of the same size reaches on the same moments alone
+(docs/experiments/belief.md). Those of all frames fit into memory. So each time the eyes look at
+every frame, a fresh judge learns from what they measured.
+"""
+
+import math
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Self
+
+import torch
+from torch import Tensor, nn
+
+from hvs_suite.policies.belief.eye import LOG_SIGMA_SLOPE, SLOPE, VISIBLE, Eye, doubt
+from hvs_suite.policies.belief.network import BeliefNetwork
+from hvs_suite.policies.belief.slope import SlopeEye, new_judge
+
+FACING = slice(SLOPE.start, LOG_SIGMA_SLOPE.stop)
+"""The part of a sighting that the judge says."""
+PASSES = 30
+BATCH = 256
+LEARNING_RATE = 2e-3
+GRADIENT_NORM = 1.0
+
+
+class Measured:
+    """Keeps what the eyes of a network give their judges, while it is open.
+
+    Args:
+        network: In evaluation mode, so that the scales of its moments stay as they are.
+    """
+
+    def __init__(self, network: BeliefNetwork) -> None:
+        self._eyes = {
+            name: eye.slope
+            for name, eye in network.eyes.items()
+            if isinstance(eye, Eye) and eye.slope is not None
+        }
+        self._numbers: dict[str, list[Tensor]] = {name: [] for name in self._eyes}
+
+    def __enter__(self) -> Self:
+        """Begin."""
+        self._hooks = [
+            eye.judge.register_forward_pre_hook(
+                lambda _, given, name=name: self._numbers[name].append(given[0])
+            )
+            for name, eye in self._eyes.items()
+        ]
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End."""
+        for hook in self._hooks:
+            hook.remove()
+
+    def fit(
+        self,
+        sightings: Mapping[str, Tensor],
+        facing: Mapping[str, Tensor],
+        visible: Mapping[str, Tensor],
+        training: Tensor,
+    ) -> None:
+        """Give each of those eyes a judge that learned from all that was measured.
+
+        Args:
+            sightings: Camera name to what the eyes said of every frame, (n, 9); gets what the new
+                judges say.
+            facing: Camera name to what is true, (n, 2).
+            visible: Camera name to whether the target can be seen, (n,) bool.
+            training: Numbers of the frames to learn from.
+        """
+        for name, eye in self._eyes.items():
+            numbers = torch.cat(self._numbers[name])
+            sighting = sightings[name]
+            seen = visible[name] & (sighting[:, VISIBLE.start] > 0.0)
+            rows = training[seen[training]]
+            if len(rows):
+                _fit(eye, numbers[rows], facing[name][rows].to(numbers.device))
+                with torch.no_grad():
+                    sighting[:, FACING] = eye.judge(numbers).cpu()
+
+
+def _fit(eye: SlopeEye, numbers: Tensor, facing: Tensor) -> None:
+    """Replace an eye's judge by one that learned from numbers (n, k) to say slopes (n, 2)."""
+    n_steps = math.ceil(PASSES * len(numbers) / BATCH)
+    # What comes out is to be a function of what was measured alone: a killed run fits it again.
+    generator = torch.Generator().manual_seed(0)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        eye.judge.load_state_dict(new_judge(numbers.shape[1]).state_dict())
+    optimizer = torch.optim.AdamW(eye.judge.parameters(), LEARNING_RATE)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, n_steps)
+    with torch.enable_grad():
+        for _ in range(n_steps):
+            rows = torch.randint(len(numbers), (BATCH,), generator=generator).to(numbers.device)
+            said = eye.judge(numbers[rows])
+            loss = doubt(said[:, :2] - facing[rows], said[:, 2:]).mean()
+            optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            nn.utils.clip_grad_norm_(eye.judge.parameters(), GRADIENT_NORM)
+            optimizer.step()
+            schedule.step()
