@@ -6,10 +6,9 @@ moments stops at twice the error that a network of the same size reaches on the 
 every frame, a fresh judge learns from what they measured.
 """
 
+import contextlib
 import math
-from collections.abc import Mapping
-from types import TracebackType
-from typing import Self
+from collections.abc import Iterator, Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -26,66 +25,63 @@ LEARNING_RATE = 2e-3
 GRADIENT_NORM = 1.0
 
 
-class Measured:
-    """Keeps what the eyes of a network give their judges, while it is open.
+@contextlib.contextmanager
+def measuring(network: BeliefNetwork) -> Iterator[dict[str, list[Tensor]]]:
+    """Keep what the eyes of a network give their judges while they look.
 
     Args:
         network: In evaluation mode, so that the scales of its moments stay as they are.
+
+    Yields:
+        Camera name of each eye with a judge to what it was given, (B, k) for each call.
     """
-
-    def __init__(self, network: BeliefNetwork) -> None:
-        self._eyes = {
-            name: eye.slope
-            for name, eye in network.eyes.items()
-            if isinstance(eye, Eye) and eye.slope is not None
-        }
-        self._numbers: dict[str, list[Tensor]] = {name: [] for name in self._eyes}
-
-    def __enter__(self) -> Self:
-        """Begin."""
-        self._hooks = [
-            eye.judge.register_forward_pre_hook(
-                lambda _, given, name=name: self._numbers[name].append(given[0])
+    numbers: dict[str, list[Tensor]] = {}
+    with contextlib.ExitStack() as hooks:
+        for name, eye in _slope_eyes(network).items():
+            given = numbers[name] = []
+            hook = eye.judge.register_forward_pre_hook(
+                lambda _, arguments, given=given: given.append(arguments[0])
             )
-            for name, eye in self._eyes.items()
-        ]
-        return self
+            hooks.callback(hook.remove)
+        yield numbers
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """End."""
-        for hook in self._hooks:
-            hook.remove()
 
-    def fit(
-        self,
-        sightings: Mapping[str, Tensor],
-        facing: Mapping[str, Tensor],
-        visible: Mapping[str, Tensor],
-        training: Tensor,
-    ) -> None:
-        """Give each of those eyes a judge that learned from all that was measured.
+def fit_judges(
+    network: BeliefNetwork,
+    numbers: Mapping[str, Sequence[Tensor]],
+    sightings: Mapping[str, Tensor],
+    facing: Mapping[str, Tensor],
+    visible: Mapping[str, Tensor],
+    training: Tensor,
+) -> None:
+    """Give each eye that tells slopes a judge which learned from all that was measured.
 
-        Args:
-            sightings: Camera name to what the eyes said of every frame, (n, 9); gets what the new
-                judges say.
-            facing: Camera name to what is true, (n, 2).
-            visible: Camera name to whether the target can be seen, (n,) bool.
-            training: Numbers of the frames to learn from.
-        """
-        for name, eye in self._eyes.items():
-            numbers = torch.cat(self._numbers[name])
-            sighting = sightings[name]
-            seen = visible[name] & (sighting[:, VISIBLE.start] > 0.0)
-            rows = training[seen[training]]
-            if len(rows):
-                _fit(eye, numbers[rows], facing[name][rows].to(numbers.device))
-                with torch.no_grad():
-                    sighting[:, FACING] = eye.judge(numbers).cpu()
+    Args:
+        network: Gets them.
+        numbers: What its eyes measured of every frame, as `measuring` yields it.
+        sightings: Camera name to what the eyes said of every frame, (n, 9); gets what the new
+            judges say.
+        facing: Camera name to what is true, (n, 2).
+        visible: Camera name to whether the target can be seen, (n,) bool.
+        training: Numbers of the frames to learn from.
+    """
+    for name, eye in _slope_eyes(network).items():
+        measured, sighting = torch.cat([*numbers[name]]), sightings[name]
+        seen = visible[name] & (sighting[:, VISIBLE.start] > 0.0)
+        rows = training[seen[training]]
+        if len(rows):
+            _fit(eye, measured[rows], facing[name][rows].to(measured.device))
+            with torch.no_grad():
+                sighting[:, FACING] = eye.judge(measured).cpu()
+
+
+def _slope_eyes(network: BeliefNetwork) -> dict[str, SlopeEye]:
+    """What tells slopes by image moments, by camera name."""
+    return {
+        name: eye.slope
+        for name, eye in network.eyes.items()
+        if isinstance(eye, Eye) and eye.slope is not None
+    }
 
 
 def _fit(eye: SlopeEye, numbers: Tensor, facing: Tensor) -> None:

@@ -24,7 +24,7 @@ from hvs_suite.policies.belief.lessons import Window, facing, remembered
 from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
 from hvs_suite.policies.belief.recorded import Recorded, recorded
 from hvs_suite.policies.imitation.demonstrations import Demonstrations
-from hvs_suite.policies.imitation.slopes import Measured
+from hvs_suite.policies.imitation.slopes import fit_judges, measuring
 
 JITTER = 0.35
 """Eyes err more on pictures that they did not learn from: by so many of their own standard
@@ -69,7 +69,7 @@ class WindowPool:
             network: In evaluation mode.
         """
         seen: dict[str, list[Tensor]] = {name: [] for name in network.shape.cameras}
-        with torch.no_grad(), Measured(network) as measured:
+        with torch.no_grad(), measuring(network) as numbers:
             for first in range(0, len(self._demonstrations), BATCH):
                 rows = np.arange(first, min(first + BATCH, len(self._demonstrations)))
                 batch = self._demonstrations.batch(rows)
@@ -78,7 +78,9 @@ class WindowPool:
         self._sightings = {name: torch.cat(parts) for name, parts in seen.items()}
         self._memory = None
         self._open(network)
-        measured.fit(
+        fit_judges(
+            network,
+            numbers,
             self._sightings,
             facing(network, self._columns[STATE][:, :N_JOINTS], self._truth),
             {name: target[:, 3] > 0.0 for name, target in self._truth.targets.items()},

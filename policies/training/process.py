@@ -29,7 +29,8 @@ def check_device(name: str) -> None:
         OptionError: It is unknown or not there.
     """
     try:
-        torch.zeros(1, device=name)
+        # Back again: torch also has devices that hold no numbers.
+        torch.zeros(1, device=name).cpu()
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
         raise OptionError(f"device {name!r} cannot be used: {reason}; use cpu") from error

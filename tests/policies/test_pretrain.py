@@ -284,6 +284,7 @@ def test_a_run_with_other_settings_is_not_mixed_into(dataset, tmp_path):
         {"steps": 1, "inputs": ("eih", "nose")},
         {"steps": 1, "inputs": ()},
         {"steps": 1, "device": "abacus"},
+        {"steps": 1, "device": "meta"},
         {"steps": 1, "eye_share": 0.0},
         {"steps": 1, "eye_share": 1.0, "dagger_rounds": 1},
     ],

@@ -6,7 +6,7 @@ import torch
 from hvs_suite.policies.belief.cell_model import cell_model
 from hvs_suite.policies.belief.eye import SLOPE, VISIBLE
 from hvs_suite.policies.belief.network import BeliefNetwork, Shape
-from hvs_suite.policies.imitation.slopes import Measured
+from hvs_suite.policies.imitation.slopes import fit_judges, measuring
 from hvs_suite.registry import find
 
 N = 600
@@ -21,24 +21,26 @@ def network() -> BeliefNetwork:
     return BeliefNetwork(shape, cell_model(find("surface-tilted"))).eval()
 
 
-def looked(network: BeliefNetwork, facing: torch.Tensor) -> tuple[Measured, torch.Tensor]:
+def looked(
+    network: BeliefNetwork, facing: torch.Tensor
+) -> tuple[dict[str, list[torch.Tensor]], torch.Tensor]:
     """What an eye measures of pictures whose brightness falls off to where the surface leans."""
     ticks = torch.linspace(-1.0, 1.0, 28)
     falls_off = facing[:, :1, None] * ticks + facing[:, 1:, None] * ticks[:, None]
     pictures = (0.5 + falls_off)[:, None].expand(-1, 3, -1, -1)
-    with torch.no_grad(), Measured(network) as measured:
+    with torch.no_grad(), measuring(network) as numbers:
         sightings = network.eyes["eih"](pictures)
     sightings[:, VISIBLE] = torch.where(SEEN, 5.0, -5.0)[:, None]
-    return measured, sightings
+    return numbers, sightings
 
 
 def test_slopes_are_learned_from_all_frames_that_show_the_target(network):
     facing = 0.2 * (2.0 * torch.rand(N, 2) - 1.0)
-    measured, sightings = looked(network, facing)
+    numbers, sightings = looked(network, facing)
     before = sightings.clone()
     # What is not seen, or not to be learned from, would teach something else.
     wrong = torch.where((SEEN & (torch.arange(N) < N // 2))[:, None], facing, -facing)
-    measured.fit({"eih": sightings}, {"eih": wrong}, {"eih": SEEN}, TRAINING)
+    fit_judges(network, numbers, {"eih": sightings}, {"eih": wrong}, {"eih": SEEN}, TRAINING)
 
     def error(told: torch.Tensor) -> float:
         return float((told[:, SLOPE] - facing)[SEEN].norm(dim=1).mean())
@@ -48,14 +50,16 @@ def test_slopes_are_learned_from_all_frames_that_show_the_target(network):
     torch.testing.assert_close(sightings[:, : SLOPE.start], before[:, : SLOPE.start])
     again, fresh = looked(network, facing)
     torch.testing.assert_close(fresh[:, SLOPE], sightings[:, SLOPE])
-    again.fit({"eih": fresh}, {"eih": wrong}, {"eih": SEEN}, TRAINING)
+    fit_judges(network, again, {"eih": fresh}, {"eih": wrong}, {"eih": SEEN}, TRAINING)
     torch.testing.assert_close(fresh, sightings)
 
 
 def test_nothing_is_learned_of_a_target_that_is_never_seen(network):
-    measured, sightings = looked(network, torch.zeros(N, 2))
+    numbers, sightings = looked(network, torch.zeros(N, 2))
     before, weights = sightings.clone(), network.eyes["eih"].slope.judge[0].weight.clone()
     never = torch.zeros(N, dtype=torch.bool)
-    measured.fit({"eih": sightings}, {"eih": torch.ones(N, 2)}, {"eih": never}, TRAINING)
+    fit_judges(
+        network, numbers, {"eih": sightings}, {"eih": torch.ones(N, 2)}, {"eih": never}, TRAINING
+    )
     torch.testing.assert_close(sightings, before)
     torch.testing.assert_close(network.eyes["eih"].slope.judge[0].weight, weights)
