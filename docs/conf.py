@@ -49,7 +49,13 @@ def read(_app: object, name: str, source: list[str]) -> None:
     source[0] = gallery.extended(name, text)
 
 
+def outdated(*_: object) -> list[str]:
+    """Pages to read anew although they have not changed: the results in them may have."""
+    return gallery.pages()
+
+
 def setup(app: "object") -> None:
     """Connect what is ours to Sphinx."""
     gallery.write(HERE / "gallery.md")
     app.connect("source-read", read)  # type: ignore[attr-defined]
+    app.connect("env-get-outdated", outdated)  # type: ignore[attr-defined]

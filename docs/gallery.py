@@ -39,16 +39,20 @@ def write(path: Path) -> None:
                 "",
             ]
         lines += ["::::", ""]
-    pages = (f"{PAGES}{name}" for name in hvs_suite.TASKS)
-    lines += ["```{toctree}", ":hidden:", "", *pages, "```", ""]
+    lines += ["```{toctree}", ":hidden:", "", *pages(), "```", ""]
     path.write_text("\n".join(lines), encoding="utf-8")
+
+
+def pages() -> list[str]:
+    """The names of the tasks' pages."""
+    return [f"{PAGES}{name}" for name in hvs_suite.TASKS]
 
 
 def extended(name: str, text: str) -> str:
     """A task's page with its film on top and the results of our policies; others as they are."""
-    task = name.removeprefix(PAGES)
-    if not name.startswith(PAGES) or task not in hvs_suite.TASKS:
+    if name not in pages():
         return text
+    task = name.removeprefix(PAGES)
     head, _, rest = text.partition("\n\n")
     film = _film(task, HERE / PAGES)
     return "\n\n".join(
