@@ -49,8 +49,8 @@ class Pretrain(Players):
             from what the eyes see. With 1 nothing but eyes comes out, for --eyes of another run.
         slopes: Cameras whose eyes tell the slope of the surface by image moments, joined by +; for
             surfaces that lean.
-        offsets: Cameras whose pose is not exact, joined by +: the belief finds out how far off they
-            show a target; for targets in sequence.
+        offsets: Cameras whose pose is not exact, joined by +: the belief finds out how they are
+            shifted and turned; for targets in sequence.
         batch_size: Frames that the eyes learn from in a step.
         device: Where the eyes learn: cpu or cuda. The rest learns on the processor.
         learning_rate: Peak of the schedule.

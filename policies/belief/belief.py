@@ -7,9 +7,9 @@ sighting is a ray, on which the target's size says how far away it is. How far t
 them, how much a target may have moved, and when to forget it because it is suddenly elsewhere, a
 small network decides from how well what is seen fits what was believed.
 
-A camera whose pose is not exact shows everything off by nearly the same. Where it is said to, the
-filter finds out by how much, from what another camera sees of the same target, and does not forget
-it with the target.
+A camera whose pose is not exact shows every place beside where it is. Where it is said to, the
+filter finds out how that camera is shifted and turned, from what another one sees of the same
+targets, and does not forget it with them.
 
 Double precision: variances of a tenth of a millimetre and of half a metre meet in one matrix.
 """
@@ -29,6 +29,7 @@ from hvs_suite.policies.belief.eye import (
     UV,
     VISIBLE,
 )
+from hvs_suite.policies.belief.geometry import cross
 
 N_MOTION = 9
 """Numbers of the state that move: place (m), velocity (m/s) and acceleration (m/s2)."""
@@ -43,6 +44,8 @@ PLACE, VELOCITY, ACCELERATION, MOTION, COVARIANCE, TILT, TILT_VARIANCE = (
     slice(BELIEF_SIZE - 1, BELIEF_SIZE),
 )
 """Where these, the covariance of the first three, and the slope and its variance stand."""
+OFFSET_SIZE = 6
+"""How a camera's pose is off: shifted (m) along and turned (rad) about the base's axes."""
 MAX_DEPTH_M = 3.5
 MIN_DEPTH_M = 0.02
 GATES_A_CAMERA = 4
@@ -71,8 +74,10 @@ class Prior:
         slope_variance: Of each.
         standoff_m: From the target along its normal to the goal of the tip (m).
         sizes: Camera name to apparent diameter (image widths) times depth (m).
-        offsets: Camera name to the covariance of how far off it shows a target, (3, 3).
-        drifts: Camera name to how much of that differs from target to target, (3, 3).
+        offsets: Camera name to the variances of how its pose is off: shift (m2) and turn (rad2),
+            along and about each axis.
+        drifts: Camera name to the variance of what no shift and turn explain, from target to
+            target (m2).
     """
 
     place: Tensor
@@ -81,8 +86,8 @@ class Prior:
     slope_variance: float
     standoff_m: float
     sizes: Mapping[str, float]
-    offsets: Mapping[str, Tensor]
-    drifts: Mapping[str, Tensor]
+    offsets: Mapping[str, tuple[float, float]]
+    drifts: Mapping[str, float]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -107,11 +112,11 @@ class Belief(nn.Module):
         cameras: Their names.
         period_s: Control period (s).
         hidden: Width of the network that sets the noises.
-        offsets: Cameras of which it finds out how far off they show a target.
+        offsets: Cameras of which it finds out how their pose is off.
 
     Attributes:
-        size: Numbers of a belief: `BELIEF_SIZE`, and then the offsets, their covariance with what
-            moves, and their own.
+        size: Numbers of a belief: `BELIEF_SIZE`, and then the offsets, `OFFSET_SIZE` a camera,
+            their covariance with what moves, and their own.
     """
 
     prior: Tensor
@@ -120,7 +125,6 @@ class Belief(nn.Module):
     offsets: Tensor
     drifts: Tensor
     transition: Tensor
-    shows: Tensor
 
     def __init__(
         self,
@@ -133,7 +137,7 @@ class Belief(nn.Module):
         super().__init__()
         self.cameras = cameras
         n = len(cameras)
-        self._off = off = 3 * len(offsets)
+        self._off = off = OFFSET_SIZE * len(offsets)
         self._of_offsets = tuple(cameras.index(name) for name in offsets)
         self.size = BELIEF_SIZE + off * (1 + N_MOTION + off)
         start = torch.zeros(BELIEF_SIZE, dtype=torch.float64)
@@ -144,16 +148,11 @@ class Belief(nn.Module):
         self.register_buffer("prior", start)
         self.register_buffer("standoff", torch.tensor(0.05, dtype=torch.float64))
         self.register_buffer("sizes", torch.full((n,), 0.02, dtype=torch.float64))
+        # Variances of the offsets, and how much they grow from target to target.
         for name in ("offsets", "drifts"):
-            start_off = 1e-4 * torch.eye(off, dtype=torch.float64)
+            start_off = torch.full((off,), 1e-4, dtype=torch.float64)
             self.register_buffer(name, start_off, persistent=off > 0)
         eye3 = torch.eye(3, dtype=torch.float64)
-        # Of place and offsets, what each camera shows: the place, and its own offset with it.
-        shows = torch.zeros(n, 3, 3 + off, dtype=torch.float64)
-        shows[:, :, :3] = eye3
-        for i, camera in enumerate(self._of_offsets):
-            shows[camera, :, 3 * i + 3 : 3 * i + 6] = eye3
-        self.register_buffer("shows", shows, persistent=False)
         self._shown = [0, 1, 2, *range(N_MOTION, N_MOTION + off)]
         transition = torch.eye(N_MOTION + off, dtype=torch.float64)
         transition[PLACE, VELOCITY] = transition[VELOCITY, ACCELERATION] = period_s * eye3
@@ -180,14 +179,16 @@ class Belief(nn.Module):
         for i, name in enumerate(self.cameras):
             self.sizes[i] = prior.sizes[name]
         for i, camera in enumerate(self._of_offsets):
-            k = slice(3 * i, 3 * i + 3)
-            self.offsets[k, k] = prior.offsets[self.cameras[camera]]
-            self.drifts[k, k] = prior.drifts[self.cameras[camera]]
+            shift, turn = prior.offsets[self.cameras[camera]]
+            k = OFFSET_SIZE * i
+            self.offsets[k : k + 3], self.offsets[k + 3 : k + 6] = shift, turn
+            self.drifts[k : k + 3] = prior.drifts[self.cameras[camera]]
+            self.drifts[k + 3 : k + 6] = 0.0
 
     def start(self, n: int) -> Tensor:
         """What is believed before anything is seen, (n, k) float64."""
         unknown = self.prior.new_zeros(self._off * (1 + N_MOTION))
-        start = torch.cat([self.prior, unknown, self.offsets.flatten()])
+        start = torch.cat([self.prior, unknown, torch.diag(self.offsets).flatten()])
         return start.expand(n, self.size).clone()
 
     def forward(
@@ -209,11 +210,8 @@ class Belief(nn.Module):
         x, P = self._state(belief)
         x, P = x @ F.T, F @ P @ F.T
         slope, slope_var = belief[:, TILT], belief[:, TILT_VARIANCE]
-        looks = [
-            self._look(i, *self._as_shown(i, x, P), sightings[c], views[c])
-            for i, c in enumerate(self.cameras)
-        ]
-        features = [look.features for look in looks]
+        rays = [self._ray(i, sightings[c], views[c]) for i, c in enumerate(self.cameras)]
+        features = [_fit(ray, *self._as_shown(i, x, P, ray)[1:]) for i, ray in enumerate(rays)]
         variances = torch.diagonal(P, dim1=1, dim2=2).clamp(min=1e-14)
         features.append(
             torch.cat([0.2 * variances.log(), 0.2 * slope_var.log(), slope], dim=1).float()
@@ -240,22 +238,21 @@ class Belief(nn.Module):
         A = self._shown
         info = P.new_zeros(n, len(A), len(A))
         vector = P.new_zeros(n, len(A))
-        for i, look in enumerate(looks):
+        for i, ray in enumerate(rays):
             gate = gates[:, GATES_A_CAMERA * i : GATES_A_CAMERA * (i + 1)]
-            place, spread = self._as_shown(i, x, P)
-            Lambda, point = self._measure(i, look, place, spread, gate)
-            H = self.shows[i]
-            info = info + H.T @ Lambda @ H
-            vector = vector + (H.T @ Lambda @ (point - place)[:, :, None])[:, :, 0]
+            H, place, spread = self._as_shown(i, x, P, ray)
+            Lambda, point = self._measure(i, ray, place, spread, gate)
+            info = info + H.transpose(1, 2) @ Lambda @ H
+            vector = vector + (H.transpose(1, 2) @ Lambda @ (point - place)[:, :, None])[:, :, 0]
         eye = torch.eye(len(A), dtype=P.dtype)
         middle = torch.linalg.inv(eye + info @ P[:, A][:, :, A])  # (I + L P)^-1
         gain = P[:, :, A] @ middle  # acts on information
         x = x + (gain @ vector[:, :, None])[:, :, 0]
         P = P - gain @ info @ P[:, A, :]
         P = 0.5 * (P + P.transpose(1, 2)) + 1e-13 * torch.eye(P.shape[1], dtype=P.dtype)
-        for i, look in enumerate(looks):
+        for i, ray in enumerate(rays):
             gate = gates[:, GATES_A_CAMERA * i : GATES_A_CAMERA * (i + 1)]
-            seen, variance = self._facing(i, look, gate)
+            seen, variance = self._facing(i, ray, gate)
             share = slope_var / (slope_var + variance)
             slope = slope + share * (seen - slope)
             slope_var = slope_var * (1.0 - share)
@@ -285,82 +282,67 @@ class Belief(nn.Module):
         prior_P = start[COVARIANCE].view(N_MOTION, N_MOTION)
         if not self._off:
             return start[MOTION], prior_P
-        own = P[:, N_MOTION:, N_MOTION:] + self.drifts
+        own = P[:, N_MOTION:, N_MOTION:] + torch.diag(self.drifts)
         corner = prior_P.expand(len(x), -1, -1)
         new_P = nn.functional.pad(corner, (0, self._off, 0, self._off))
         new_P = new_P + nn.functional.pad(own, (N_MOTION, 0, N_MOTION, 0))
         return torch.cat([start[MOTION].expand(len(x), -1), x[:, N_MOTION:]], dim=1), new_P
 
-    def _as_shown(self, i: int, x: Tensor, P: Tensor) -> tuple[Tensor, Tensor]:
-        """Where a camera shows the target, (B, 3) m, and the covariance, (B, 3, 3)."""
-        H, A = self.shows[i], self._shown
-        return x[:, A] @ H.T, H @ P[:, A][:, :, A] @ H.T
+    def _as_shown(self, i: int, x: Tensor, P: Tensor, ray: "_Ray") -> tuple[Tensor, Tensor, Tensor]:
+        """Where a camera shows the target, (B, 3) m, and the covariance, (B, 3, 3).
 
-    def _look(self, i: int, place: Tensor, P: Tensor, sighting: Tensor, view: View) -> "_Look":
-        """A sighting as a ray, and how it fits where the camera should show the target."""
+        A camera at o that is shifted by s and turned by w, both small, shows a place p at
+        p + s + w x (p - o). The way p - o is taken along the ray, by what is believed of p.
+
+        Returns:
+            Before them, what of place and offsets this is, (B, 3, 3 + offsets).
+        """
+        A = self._shown
+        H = torch.eye(3, len(A), dtype=P.dtype).repeat(len(x), 1, 1)
+        if i in self._of_offsets:
+            k = 3 + OFFSET_SIZE * self._of_offsets.index(i)
+            share_var = ray.sighting[:, LOG_SIGMA_SIZE].exp() ** 2
+            share_var = share_var + self.log_floors[i, 2].double().exp() ** 2
+            depth = ray.likeliest(x[:, PLACE], P[:, PLACE, PLACE], share_var)
+            H[:, :, k : k + 3] = torch.eye(3, dtype=P.dtype)
+            H[:, :, k + 3 : k + 6] = cross(-depth * ray.direction)
+        return H, (H @ x[:, A, None])[:, :, 0], H @ P[:, A][:, :, A] @ H.transpose(1, 2)
+
+    def _ray(self, i: int, sighting: Tensor, view: View) -> "_Ray":
+        """A sighting as a ray."""
         s = sighting.double()
         uv = s[:, UV].clamp(-1.6, 1.6) * view.tan
         ray = torch.cat([uv, torch.ones_like(uv[:, :1])], dim=1)
         length = ray.norm(dim=1, keepdim=True)
         direction = (view.rotation @ (ray / length)[:, :, None])[:, :, 0]
         by_size = self.sizes[i] * torch.exp(-s[:, LOG_DIAMETER].clamp(-6.0, 1.0)) * length
-        by_size = by_size.clamp(MIN_DEPTH_M, MAX_DEPTH_M)
-        offset = place - view.origin
-        along = (offset * direction).sum(dim=1, keepdim=True)
-        miss = offset - along * direction
-        miss_m = miss.norm(dim=1, keepdim=True)
-        spread = torch.diagonal(P, dim1=1, dim2=2).sum(dim=1, keepdim=True).sqrt()
-        sigma_m = s[:, LOG_SIGMA_UV].exp() * view.tan * by_size
-        doubt = torch.sqrt(spread**2 + sigma_m**2)
-        visible = s[:, VISIBLE]
-        features = torch.cat(
-            [
-                torch.tanh(visible / 4.0),
-                torch.tanh(visible / 20.0),
-                0.3 * s[:, LOG_SIGMA_UV],
-                0.3 * s[:, LOG_SIGMA_SIZE],
-                0.3 * s[:, LOG_SIGMA_SLOPE],
-                0.3 * by_size.log(),
-                0.2 * torch.log(miss_m / doubt + 1e-3),
-                0.2 * torch.log(miss_m + 1e-4),
-                (along / by_size - 1.0).clamp(-2.0, 2.0),
-            ],
-            dim=1,
-        )
-        return _Look(s, view, direction, length, by_size, features.float())
+        return _Ray(s, view, direction, length, by_size.clamp(MIN_DEPTH_M, MAX_DEPTH_M))
 
     def _measure(
-        self, i: int, look: "_Look", place: Tensor, P: Tensor, gate: Tensor
+        self, i: int, ray: "_Ray", place: Tensor, P: Tensor, gate: Tensor
     ) -> tuple[Tensor, Tensor]:
         """What a ray says of the place: information (B, 3, 3), and the point on it (B, 3)."""
-        s, d = look.sighting, look.direction
+        s, d = ray.sighting, ray.direction
         log_floors = self.log_floors[i].double()
         loud = torch.exp(2.0 * torch.tanh(gate[:, :3] / 2.0) * 2.0)  # of variances, e^-4 to e^4
         share_var = (s[:, LOG_SIGMA_SIZE].exp() ** 2 + log_floors[2].exp() ** 2) * loud[:, 1:2]
-        # Where the ray is most likely met: by what was believed, and by the size.
-        believed = torch.linalg.inv(P)
-        Pd = (believed @ d[:, :, None])[:, :, 0]
-        weight = (Pd * d).sum(dim=1, keepdim=True)
-        at = (Pd * (place - look.view.origin)).sum(dim=1, keepdim=True)
-        size_weight = 1.0 / (share_var * look.by_size**2)
-        depth = (at + size_weight * look.by_size) / (weight + size_weight)
-        depth = depth.clamp(MIN_DEPTH_M, MAX_DEPTH_M).detach()
-        angle = s[:, LOG_SIGMA_UV].exp() * look.view.tan / look.length
+        depth = ray.likeliest(place, P, share_var)
+        angle = s[:, LOG_SIGMA_UV].exp() * ray.view.tan / ray.length
         across_var = ((angle**2 + log_floors[0].exp() ** 2) * depth**2) * loud[:, :1]
         across_var = across_var + log_floors[1].exp() ** 2
-        along_var = share_var * look.by_size**2 + log_floors[1].exp() ** 2
+        along_var = share_var * ray.by_size**2 + log_floors[1].exp() ** 2
         there = _there(s, gate)
         outer = d[:, :, None] * d[:, None]
         eye3 = torch.eye(3, dtype=P.dtype)
         info = (eye3 - outer) / across_var[:, :, None] + outer / along_var[:, :, None]
-        return there[:, :, None] ** 2 * info, look.view.origin + look.by_size * d
+        return there[:, :, None] ** 2 * info, ray.view.origin + ray.by_size * d
 
-    def _facing(self, i: int, look: "_Look", gate: Tensor) -> tuple[Tensor, Tensor]:
+    def _facing(self, i: int, ray: "_Ray", gate: Tensor) -> tuple[Tensor, Tensor]:
         """What a sighting says of the slope (B, 2), and its variance (B, 1)."""
-        s = look.sighting
+        s = ray.sighting
         xy = s[:, SLOPE].clamp(-0.95, 0.95)
         z = -torch.sqrt((1.0 - xy.square().sum(dim=1, keepdim=True)).clamp(min=0.05))
-        normal = (look.view.rotation @ torch.cat([xy, z], dim=1)[:, :, None])[:, :, 0]
+        normal = (ray.view.rotation @ torch.cat([xy, z], dim=1)[:, :, None])[:, :, 0]
         up = normal[:, 2:]
         slope = (normal[:, :2] / up.clamp(min=0.2)).clamp(-1.5, 1.5)
         floor = self.log_floors[i, 3].double().exp()
@@ -387,13 +369,48 @@ def _there(sighting: Tensor, gate: Tensor) -> Tensor:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Look:
+class _Ray:
+    """On which a sighting says that the target lies, and how far away (m) by its size."""
+
     sighting: Tensor
     view: View
     direction: Tensor
     length: Tensor
     by_size: Tensor
-    features: Tensor
+
+    def likeliest(self, place: Tensor, P: Tensor, share_var: Tensor) -> Tensor:
+        """How far away it is most likely met (B, 1) m: by a Gaussian place, and by the size."""
+        d = self.direction
+        Pd = (torch.linalg.inv(P) @ d[:, :, None])[:, :, 0]
+        weight = (Pd * d).sum(dim=1, keepdim=True)
+        at = (Pd * (place - self.view.origin)).sum(dim=1, keepdim=True)
+        size_weight = 1.0 / (share_var * self.by_size**2)
+        depth = (at + size_weight * self.by_size) / (weight + size_weight)
+        return depth.clamp(MIN_DEPTH_M, MAX_DEPTH_M).detach()
+
+
+def _fit(ray: _Ray, place: Tensor, P: Tensor) -> Tensor:
+    """How a sighting fits where its camera should show the target, (B, `FEATURES_A_CAMERA`)."""
+    s, by_size = ray.sighting, ray.by_size
+    offset = place - ray.view.origin
+    along = (offset * ray.direction).sum(dim=1, keepdim=True)
+    miss_m = (offset - along * ray.direction).norm(dim=1, keepdim=True)
+    spread = torch.diagonal(P, dim1=1, dim2=2).sum(dim=1, keepdim=True).sqrt()
+    sigma_m = s[:, LOG_SIGMA_UV].exp() * ray.view.tan * by_size
+    doubt = torch.sqrt(spread**2 + sigma_m**2)
+    visible = s[:, VISIBLE]
+    features = [
+        torch.tanh(visible / 4.0),
+        torch.tanh(visible / 20.0),
+        0.3 * s[:, LOG_SIGMA_UV],
+        0.3 * s[:, LOG_SIGMA_SIZE],
+        0.3 * s[:, LOG_SIGMA_SLOPE],
+        0.3 * by_size.log(),
+        0.2 * torch.log(miss_m / doubt + 1e-3),
+        0.2 * torch.log(miss_m + 1e-4),
+        (along / by_size - 1.0).clamp(-2.0, 2.0),
+    ]
+    return torch.cat(features, dim=1).float()
 
 
 def belief_loss(

@@ -12,6 +12,13 @@ from torch import Tensor
 from hvs_suite.cell.robot import FLANGE_HEIGHT_M, JOINT_AXES, JOINT_HEIGHTS_M
 
 
+def cross(a: Tensor) -> Tensor:
+    """Matrices (B, 3, 3) that do to a vector what a x does, for a (B, 3)."""
+    x, y, z = a.unbind(dim=1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).view(-1, 3, 3)
+
+
 def _joint_tables() -> tuple[Tensor, ...]:
     """What makes the turn of joint i: fixed + sine sin(q) + cosine cos(q), and the ways between.
 
@@ -23,9 +30,7 @@ def _joint_tables() -> tuple[Tensor, ...]:
     """
     axes = torch.tensor(JOINT_AXES, dtype=torch.float64)
     along = axes[:, :, None] * axes[:, None]
-    x, y, z = axes.unbind(dim=1)
-    zero = torch.zeros_like(x)
-    skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).view(-1, 3, 3)
+    skew = cross(axes)
     heights = torch.tensor([0.0, *JOINT_HEIGHTS_M, FLANGE_HEIGHT_M], dtype=torch.float64)
     return along, skew, torch.eye(3, dtype=torch.float64) - along, heights.diff()[:, None], axes
 

@@ -105,8 +105,8 @@ class Shape:
         slopes: Cameras whose eyes tell slopes by image moments, see
             `hvs_suite.policies.belief.slope`. With any, the head may let the tool lean about the
             target.
-        offsets: Cameras whose pose is not exact, and of which the belief finds out how far off they
-            show a target.
+        offsets: Cameras whose pose is not exact, and of which the belief finds out how they are
+            shifted and turned.
     """
 
     cameras: Mapping[str, tuple[int, int]]

@@ -8,8 +8,15 @@ import torch
 from torch import Tensor
 
 from hvs_suite.datasets.features import STATE
-from hvs_suite.policies.belief.belief import ACCELERATION, N_MOTION, PLACE, VELOCITY, Prior, View
-from hvs_suite.policies.belief.geometry import flange_motion
+from hvs_suite.policies.belief.belief import (
+    ACCELERATION,
+    N_MOTION,
+    PLACE,
+    VELOCITY,
+    Prior,
+    View,
+)
+from hvs_suite.policies.belief.geometry import cross, flange_motion
 from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
 from hvs_suite.policies.belief.recorded import shown_goals
 from hvs_suite.policies.training.dataset import (
@@ -24,6 +31,7 @@ WIDER = 1.5
 PLACE_FLOOR_M = 2e-5
 MOTION_FLOOR = 1e-5
 """Of velocities (m/s) and accelerations (m/s2)."""
+EM_ROUNDS = 200
 SLOPE_VARIANCE_FLOOR = 1e-7
 """Where all demonstrations are alike, the prior is not quite certain."""
 UNSEEN_SIZE = 0.02
@@ -48,8 +56,10 @@ def fit_prior(
     apparent diameter times depth.
 
     How far off a camera shows a target is the vector from the target to the nearest point of its
-    nominal ray. Its covariance is about zero, and its drift twice the covariance about the
-    episode's mean: the difference between two targets of an episode.
+    nominal ray. If a camera is shifted by s and turned by w in an episode, that is what of
+    s + w x (g_i - s n_i - o_i) lies across the ray. The variances of s and w and that of what is
+    left come from expectation maximisation (Dempster, Laird and Rubin, 1977), of one look at each
+    target.
 
     Args:
         columns: ``privileged.goal_position`` and ``privileged.goal_normal`` (n, 3),
@@ -89,8 +99,8 @@ def fit_prior(
         slope_variance=float(WIDER * spread + SLOPE_VARIANCE_FLOOR),
         standoff_m=standoff,
         sizes={name: _size(place, targets[name], view) for name, view in views.items()},
-        offsets={name: off[0] for name, off in offsets.items()},
-        drifts={name: off[1] for name, off in offsets.items()},
+        offsets={name: off[:2] for name, off in offsets.items()},
+        drifts={name: off[2] for name, off in offsets.items()},
     )
 
 
@@ -124,21 +134,41 @@ def _size(place: Tensor, target: Tensor, view: View) -> float:
     return float((target[:, 2] * depth)[seen].median())
 
 
-def _offset(place: Tensor, target: Tensor, view: View, episode: Tensor) -> tuple[Tensor, Tensor]:
-    """Covariance (3, 3) of how far off a camera shows targets, and of its changes."""
+def _offset(
+    place: Tensor, target: Tensor, view: View, episode: Tensor
+) -> tuple[float, float, float]:
+    """Variances of a camera's shift (m2) and turn (rad2), and of what they leave (m2)."""
+    floor = PLACE_FLOOR_M**2
     seen = _in_view(target)
-    direction, way = _rays(target, view)[seen], (place - view.origin)[seen]
-    off = (way * direction).sum(dim=1, keepdim=True) * direction - way
-    floor = PLACE_FLOOR_M**2 * torch.eye(3, dtype=off.dtype)
-    if len(off) == 0:
-        return floor, floor
-    episode = episode[seen]
-    n = torch.zeros(int(episode.max()) + 1, dtype=off.dtype).index_add(
-        0, episode, torch.ones_like(off[:, 0])
-    )
-    mean = torch.zeros(len(n), 3, dtype=off.dtype).index_add(0, episode, off)
-    change = off - (mean / n.clamp(min=1.0)[:, None])[episode]
-    return off.T @ off / len(off) + floor, 2.0 * change.T @ change / len(off) + floor
+    if not seen.any():
+        return floor, floor, floor
+    place, origin, episode = place[seen], view.origin[seen], episode[seen]
+    direction = _rays(target, view)[seen]
+    # Further looks at a target say nothing more of the pose.
+    new = torch.ones_like(episode, dtype=torch.bool)
+    new[1:] = (episode.diff() != 0) | (place.diff(dim=0) != 0.0).any(dim=1)
+    way, direction = (place - origin)[new], direction[new]
+    number = torch.unique_consecutive(episode[new], return_inverse=True)[1]
+    eye3 = torch.eye(3, dtype=way.dtype)
+    across = eye3 - direction[:, :, None] * direction[:, None]
+    off = -(across @ way[:, :, None])
+    A = across @ torch.cat([eye3.expand(len(way), 3, 3), cross(-way)], dim=2)
+    n = int(number[-1]) + 1
+    M = way.new_zeros(n, 6, 6).index_add(0, number, A.transpose(1, 2) @ A)
+    b = way.new_zeros(n, 6, 1).index_add(0, number, A.transpose(1, 2) @ off)
+    total = off.square().sum()
+    left = total / (2 * len(way)) + floor
+    shift, turn = 0.5 * left, 0.5 * left / way.square().sum(dim=1).mean()
+    for _ in range(EM_ROUNDS):
+        known = torch.diag(torch.cat([(1.0 / shift).expand(3), (1.0 / turn).expand(3)]))
+        spread = torch.linalg.inv(M / left + known)
+        mean = spread @ b / left
+        second = spread + mean @ mean.transpose(1, 2)
+        squares = torch.diagonal(second, dim1=1, dim2=2).mean(dim=0)
+        shift, turn = squares[:3].mean() + floor, squares[3:].mean() + floor
+        rest = total - 2.0 * (mean * b).sum() + (M * second).sum()
+        left = rest.clamp(min=0.0) / (2 * len(way)) + floor
+    return float(shift), float(turn), float(left)
 
 
 def _rays(target: Tensor, view: View) -> Tensor:
