@@ -291,8 +291,8 @@ class Belief(nn.Module):
     def _as_shown(self, i: int, x: Tensor, P: Tensor, ray: "_Ray") -> tuple[Tensor, Tensor, Tensor]:
         """Where a camera shows the target, (B, 3) m, and the covariance, (B, 3, 3).
 
-        A camera at o that is shifted by s and turned by w, both small, shows a place p at
-        p + s + w x (p - o). The way p - o is taken along the ray, by what is believed of p.
+        A camera taken to be at o that is shifted by -s and turned by -w, both small, shows a place
+        p at p + s + w x (p - o). The way p - o is taken along the ray, by what is believed of p.
 
         Returns:
             Before them, what of place and offsets this is, (B, 3, 3 + offsets).
