@@ -102,7 +102,12 @@ class Demonstrator(Expert):
     @property
     def _has_seen_closely(self) -> bool:
         """Whether it is known exactly enough where the target is to go there."""
-        return self._n_compared == len(LOOK_DOWN_M) or "eih" in self._seen_by
+        return self._knows_far_camera or "eih" in self._seen_by
+
+    @property
+    def _knows_far_camera(self) -> bool:
+        """Whether it is known how the eye-to-hand camera is shifted and turned."""
+        return self._n_compared == len(LOOK_DOWN_M)
 
     def _next_set_point(
         self, q: FloatArray, velocity: FloatArray, set_point: FloatArray
@@ -111,7 +116,7 @@ class Demonstrator(Expert):
         if self._target is not None and not _is_same(self._target, goal):
             self._begin_target(goal.target)
         self._target = goal.target
-        if not (self._seen_by and self._n_compared == len(LOOK_DOWN_M)):
+        if not (self._seen_by and self._knows_far_camera):
             self._look()
         if not self._seen_by:
             ahead = self._planner.towards_posture(q, velocity, self._next_look(q))

@@ -148,12 +148,27 @@ def _offset(
     across = eye3 - direction[:, :, None] * direction[:, None]
     off = -(across @ way[:, :, None])
     A = across @ torch.cat([eye3.expand(len(way), 3, 3), cross(-way)], dim=2)
+    return _pose_variances(A, off, number, floor)
+
+
+def _pose_variances(
+    A: Tensor, off: Tensor, number: Tensor, floor: float
+) -> tuple[float, float, float]:
+    """What `_offset` returns, by expectation maximisation.
+
+    Args:
+        A: What shift and turn move, across each ray, (k, 3, 6).
+        off: How far off each ray is, (k, 3, 1) m.
+        number: Of each look's episode, (k,), from 0 on.
+        floor: Least variance (m2, rad2).
+    """
     n = int(number[-1]) + 1
-    M = way.new_zeros(n, 6, 6).index_add(0, number, A.transpose(1, 2) @ A)
-    b = way.new_zeros(n, 6, 1).index_add(0, number, A.transpose(1, 2) @ off)
+    M = A.new_zeros(n, 6, 6).index_add(0, number, A.transpose(1, 2) @ A)
+    b = A.new_zeros(n, 6, 1).index_add(0, number, A.transpose(1, 2) @ off)
     total = off.square().sum()
-    left = total / (2 * len(way)) + floor
-    shift, turn = 0.5 * left, 0.5 * left / way.square().sum(dim=1).mean()
+    left = total / (2 * len(off)) + floor
+    # Half of it each, to begin with.
+    shift, turn = 0.5 * left, left / A[:, :, 3:].square().sum(dim=(1, 2)).mean()
     for _ in range(EM_ROUNDS):
         known = torch.diag(torch.cat([(1.0 / shift).expand(3), (1.0 / turn).expand(3)]))
         spread = torch.linalg.inv(M / left + known)
@@ -162,7 +177,7 @@ def _offset(
         squares = torch.diagonal(second, dim1=1, dim2=2).mean(dim=0)
         shift, turn = squares[:3].mean() + floor, squares[3:].mean() + floor
         rest = total - 2.0 * (mean * b).sum() + (M * second).sum()
-        left = rest.clamp(min=0.0) / (2 * len(way)) + floor
+        left = rest.clamp(min=0.0) / (2 * len(off)) + floor
     return float(shift), float(turn), float(left)
 
 
