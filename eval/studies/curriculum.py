@@ -5,16 +5,15 @@ Budget: on one core 16,000 environment steps took 7 to 14 minutes
 demonstrations, with five seeds: 8 hours on one core, 4 on two.
 """
 
-import dataclasses
 import typing
 
 from hvs_suite.eval.studies.grid import Cell, Plan
 from hvs_suite.eval.studies.training import Scenes
-from hvs_suite.eval.studies.ways import FEW, TRIAL, imitation, tuned
+from hvs_suite.eval.studies.ways import from_few, tuned
 from hvs_suite.policies.rl.curriculum import Kind
 
 TASK = "align-thesis"
-DEMONSTRATIONS = (25, 50)
+DEMONSTRATIONS = (10, 25)
 NONE = "no curriculum"
 
 
@@ -29,8 +28,8 @@ def plan(*, quick: bool = False) -> Plan:
         **{f"{kind} curriculum": kind for kind in typing.get_args(Kind)},
     }
     cells = []
-    for n in (TRIAL.demonstrations,) if quick else DEMONSTRATIONS:
-        base = imitation(TASK, TRIAL if quick else dataclasses.replace(FEW, demonstrations=n))
+    for n in DEMONSTRATIONS[:1] if quick else DEMONSTRATIONS:
+        base = from_few(TASK, quick=quick, demonstrations=n)
         cells += [
             Cell(
                 group=f"{TASK}, from {n} demonstrations",
@@ -45,6 +44,6 @@ def plan(*, quick: bool = False) -> Plan:
         name="curriculum",
         question="What does a curriculum buy (D.6)?",
         cells=cells,
-        seeds=1 if quick else 5,
-        episodes=2 if quick else 200,
+        seeds=1 if quick else 3,
+        episodes=2 if quick else 100,
     )

@@ -13,7 +13,7 @@ from typing import Any
 
 from hvs_suite.eval.studies.grid import Cell, Plan
 from hvs_suite.eval.studies.training import Scenes
-from hvs_suite.eval.studies.ways import FEW, TRIAL, Way, imitation, tuned
+from hvs_suite.eval.studies.ways import Way, from_few, tuned
 from hvs_suite.tasks.shared.spec import THESIS_REWARDS
 
 TASK = "align-thesis"
@@ -40,7 +40,7 @@ def plan(*, quick: bool = False) -> Plan:
     Args:
         quick: Make everything in minutes, of next to no training.
     """
-    base = imitation(TASK, TRIAL if quick else FEW)
+    base = from_few(TASK, quick=quick)
     ways: dict[str, Way] = {
         name: tuned(
             base,
@@ -67,5 +67,5 @@ def plan(*, quick: bool = False) -> Plan:
         question="Which rewards help (D.4)?",
         cells=cells,
         seeds=1 if quick else 3,
-        episodes=2 if quick else 200,
+        episodes=2 if quick else 100,
     )

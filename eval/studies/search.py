@@ -23,7 +23,7 @@ import pydantic
 from hvs_suite.errors import OptionError, OutputError, TrainingError
 from hvs_suite.eval.studies.grid import Cell, Finished, Maker, make_all
 from hvs_suite.eval.studies.training import Report, Scenes
-from hvs_suite.eval.studies.ways import FEW, TRIAL, Effort, Way, imitation, tuned
+from hvs_suite.eval.studies.ways import TRIAL, Effort, Way, from_few, imitation, tuned
 from hvs_suite.executor import Workers, check_workers, size
 
 if TYPE_CHECKING:
@@ -259,7 +259,7 @@ def _cell(learner: Learner, number: int, settings: Mapping[str, Any], quick: boo
         effort = TRIAL if quick else IMITATION
         way = imitation(TASK, effort, **settings)
     else:
-        way = tuned(imitation(TASK, TRIAL if quick else FEW), TASK, quick=quick, settings=settings)
+        way = tuned(from_few(TASK, quick=quick), TASK, quick=quick, settings=settings)
     return Cell(group=TASK, name=f"trial {number}", way=way, on=[Scenes(task=TASK)])
 
 

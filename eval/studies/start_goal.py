@@ -13,7 +13,7 @@ from typing import Any
 
 from hvs_suite.eval.studies.grid import Cell, Plan
 from hvs_suite.eval.studies.training import Scenes
-from hvs_suite.eval.studies.ways import FEW, TRIAL, Effort, Way, imitation, tuned
+from hvs_suite.eval.studies.ways import TRIAL, Effort, Way, from_few, imitation, tuned
 
 TASK = "align-thesis"
 EFFORT = Effort(demonstrations=600, steps=2500, dagger_rounds=2)
@@ -45,7 +45,7 @@ def plan(*, quick: bool = False) -> Plan:
         return {
             "imitation": imitation(TASK, TRIAL if quick else EFFORT, options),
             "RL from few demonstrations": tuned(
-                imitation(TASK, TRIAL if quick else FEW, options),
+                from_few(TASK, options, quick=quick),
                 TASK,
                 quick=quick,
                 options=options,
