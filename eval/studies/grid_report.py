@@ -24,44 +24,60 @@ def markdown(study: Study) -> str:
             f"{n} scenes of split `{SPLIT}` a seed. Intervals are of 95 %, made of Wilson's; p is "
             "of McNemar's exact test on the same scenes and seeds, after Holm's correction.",
             "",
-            *_table(rows),
+            *table(rows),
             "",
             *_words(rows),
         ]
-    lines += ["", "The commands that make each policy again are in study.json, and in cells/."]
+    lines += [
+        "",
+        "The commands that make each policy again are in study.json, and in cells/. Give them with "
+        "`OMP_NUM_THREADS=1`: cells are made on one thread, and some processors round otherwise "
+        "with two.",
+    ]
     return "\n".join(lines) + "\n"
 
 
-def _table(rows: Sequence[Row]) -> list[str]:
-    several = len({row.scenes for row in rows}) > 1
-    metric = rows[0].judged[0].metric
-    heads = ["setting", *(["played"] if several else []), "solved", "95 % interval", "each seed"]
-    heads += ["collisions", "steps", f"settled {metric}"]
-    heads += ["compared with", "only it, only this", "p", "minutes"]
-    return [
-        f"| {' | '.join(heads)} |",
-        f"|{'---|' * len(heads)}",
-        *(f"| {' | '.join(_cells(row, several))} |" for row in rows),
-    ]
+def table(rows: Sequence[Row]) -> list[str]:
+    """A table of a group in Markdown, line by line.
+
+    A column that would say the same in every row is left out.
+
+    Args:
+        rows: As `Study.rows` gives them.
+    """
+    columns = {
+        "setting": [row.name for row in rows],
+        "played": [row.scenes for row in rows],
+        "solved": [f"{row.rate:.1f} %" for row in rows],
+        "95 % interval": [f"{row.interval[0]:.1f} to {row.interval[1]:.1f} %" for row in rows],
+        "each seed": [", ".join(f"{rate:.1f}" for rate in row.rates) for row in rows],
+        "collisions": [str(sum(each.n_collision for each in row.judged)) for row in rows],
+        "steps": [_mean([each.steps_to_goal for each in row.judged], 1) for row in rows],
+        f"settled {rows[0].judged[0].metric}": [
+            _mean([each.settled for each in row.judged], 2) for row in rows
+        ],
+        "compared with": [str(row.cell[0].against) if row.p is not None else "-" for row in rows],
+        "only it, only this": [
+            f"{row.only_other}, {row.only_this}" if row.p is not None else "-" for row in rows
+        ],
+        "p": [f"{row.p:.2g}" if row.p is not None else "-" for row in rows],
+        "minutes": [_mean([each.minutes for each in row.cell], 1) for row in rows],
+    }
+    needless = {
+        "played": len({row.scenes for row in rows}) == 1,
+        "each seed": max(len(row.rates) for row in rows) == 1,
+        "collisions": not any(each.n_collision for row in rows for each in row.judged),
+        # The words below the table name it.
+        "compared with": len({row.cell[0].against for row in rows if row.p is not None}) <= 1,
+    }
+    shown = {name: cells for name, cells in columns.items() if not needless.get(name)}
+    lines = [f"| {' | '.join(shown)} |", f"|{'---|' * len(shown)}"]
+    return lines + [f"| {' | '.join(cells)} |" for cells in zip(*shown.values(), strict=True)]
 
 
-def _cells(row: Row, several: bool) -> list[str]:
-    steps = [each.steps_to_goal for each in row.judged if each.steps_to_goal is not None]
-    compared = ["-", "-", "-"]
-    if row.p is not None:
-        compared = [str(row.cell[0].against), f"{row.only_other}, {row.only_this}", f"{row.p:.2g}"]
-    return [
-        row.name,
-        *([row.scenes] if several else []),
-        f"{row.rate:.1f} %",
-        f"{row.interval[0]:.1f} to {row.interval[1]:.1f} %",
-        ", ".join(f"{rate:.1f}" for rate in row.rates),
-        str(sum(each.n_collision for each in row.judged)),
-        f"{sum(steps) / len(steps):.1f}" if steps else "-",
-        f"{sum(each.settled for each in row.judged) / len(row.judged):.2f}",
-        *compared,
-        f"{sum(each.minutes for each in row.cell) / len(row.cell):.1f}",
-    ]
+def _mean(values: Sequence[float | None], digits: int) -> str:
+    known = [value for value in values if value is not None]
+    return f"{sum(known) / len(known):.{digits}f}" if known else "-"
 
 
 def _words(rows: Sequence[Row]) -> list[str]:

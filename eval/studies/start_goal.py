@@ -16,7 +16,7 @@ from hvs_suite.eval.studies.training import Scenes
 from hvs_suite.eval.studies.ways import TRIAL, Effort, Way, from_few, imitation, tuned
 
 TASK = "align-thesis"
-EFFORT = Effort(demonstrations=600, steps=2500, dagger_rounds=2)
+EFFORT = Effort(demonstrations=300, steps=800, dagger_rounds=2)
 STARTS = {"fixed start": "zero", "random start": "random"}
 GOALS: dict[str, Any] = {"fixed goal": (0.5, 0.2), "random goal": "random"}
 TIME_LIMIT_STEPS = 40
@@ -43,7 +43,7 @@ def plan(*, quick: bool = False) -> Plan:
 
     def ways(options: dict[str, Any]) -> dict[str, Way]:
         return {
-            "imitation": imitation(TASK, TRIAL if quick else EFFORT, options),
+            "imitation": imitation(TASK, TRIAL if quick else EFFORT, options, eyes=TASK),
             "RL from few demonstrations": tuned(
                 from_few(TASK, options, quick=quick),
                 TASK,

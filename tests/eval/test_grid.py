@@ -28,6 +28,7 @@ from hvs_suite.eval.studies.training import Scenes
 from hvs_suite.eval.studies.ways import Imitation, Recording
 from hvs_suite.policies.training.dataset import read_manifest
 from hvs_suite.registry import find
+from hvs_suite.rollout import one_torch_thread
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "align-thesis"
 STUDIES: dict[str, Callable[..., Plan]] = {
@@ -93,10 +94,11 @@ def test_a_killed_study_goes_on_and_nothing_is_made_twice(tmp_path):
     again = run_grid(PLAN, tmp_path, lambda *words: reports.append(words[0]), workers=1)
     assert again == study
     assert not reports
-    # Its commands make the same policy, and the same result.
+    # Its commands make the same policy, and the same result, on as many threads.
     maker = Maker(tmp_path / "again", tmp_path / "again", PLAN.episodes)
-    for line in maker.commands(PLAN.cells[1], 0):
-        assert run(shlex.split(line)[1:]) == 0
+    with one_torch_thread():
+        for line in maker.commands(PLAN.cells[1], 0):
+            assert run(shlex.split(line)[1:]) == 0
     runs = [PLAN.cells[1].way.folder(out, 0) for out in (tmp_path, tmp_path / "again")]
     ours, theirs = (load_file(each / "policy/model.safetensors") for each in runs)
     assert all(ours[name].equal(theirs[name]) for name in ours)
@@ -172,7 +174,12 @@ def test_tables_say_what_was_found():
 def test_cells_that_play_several_scenes_make_a_map():
     cells = [finished("whole", "11", "10", against=None), finished("other", "00", "11")]
     study = Study(name="s", question="?", finished=cells)
-    assert "| other | test 1 | 100.0 % |" in grid_report.markdown(study)
+    text = grid_report.markdown(study)
+    assert "| other | test 1 | 100.0 % |" in text
+    # There is one seed, and all are compared with the same.
+    assert "each seed" not in text
+    assert "compared with" not in text
+    assert "| collisions |" in text
     [axes] = grid_report.draw(study).axes
     assert [text.get_text() for text in axes.texts] == ["100", "50", "0", "100"]
 
