@@ -1,8 +1,8 @@
 """Thesis, D.6: what a curriculum buys RL that begins with few demonstrations.
 
-Budget: on one core 16,000 environment steps took 7 to 14 minutes
-(docs/experiments/first-design.md), evaluations 3 more. Three cells, from 25 and from 50
-demonstrations, with five seeds: 8 hours on one core, 4 on two.
+Budget: on one core 8,000 environment steps with their evaluations took 5 to 6 minutes
+(docs/answers.md). Three cells, from 10 and from 25 demonstrations, with three seeds: 1.7 hours on
+one core.
 """
 
 import typing

@@ -4,10 +4,10 @@ Actions are joint positions, so a policy that is given none still knows what it 
 the joints from there and from where the arm starts: in two episodes of the expert on each task to
 1.4 mrad, which is a millimetre at the tip.
 
-Budget: on one core 4,000 optimiser steps on ``align-thesis`` took 9 minutes and 5,000 on
-``track-line`` 18 (metadata of the shipped weights' results); rounds of DAgger, decoding and 200
-scenes come to 4 minutes more. So a cell takes 11 and 18 minutes, and the 24 cells with two seeds
-12 hours on one core, 6 on two.
+Budget: on one core a cell on ``align-thesis`` took 5 to 10 minutes to train and 1 to play
+(docs/answers.md), so twelve of them with two seeds take 3 hours on one core. Those on
+``track-line``, which were not timed, learn half as many steps and begin with the eyes of the
+shipped weights.
 """
 
 from hvs_suite.eval.studies.grid import Cell, Plan

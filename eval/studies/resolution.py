@@ -18,6 +18,8 @@ EFFORTS = {
 }
 NAMES = {"eih": "eye in hand", "eth": "eye to hand"}
 WHOLE = "both 112 px, colour"
+IN_COLOUR: dict[str, Any] = {}
+"""Settings of a policy that no camera shows in grey."""
 
 
 def plan(*, quick: bool = False) -> Plan:
@@ -41,7 +43,7 @@ def plan(*, quick: bool = False) -> Plan:
                 task,
                 TRIAL if quick else effort,
                 options,
-                **({"grey": grey} if grey else {}),
+                **({"grey": grey} if grey else IN_COLOUR),
             ),
             on=[Scenes(task=task, options={**options, **{f"{each}_channels": 1 for each in grey}})],
             against=None if name == WHOLE else WHOLE,

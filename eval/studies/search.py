@@ -7,8 +7,8 @@ search goes on: trials that had begun are made first, from where they were.
 Budget: on one core 4,000 optimiser steps on ``align-thesis`` took 9 minutes (metadata of the
 shipped weights' result), so a trial of imitation, 1,000 steps of the default size and 200 scenes,
 takes some 5, and 80 trials 7 hours on one core, 3.5 on two; trials with large batches take longer.
-RL takes 16 minutes a trial with 16,000 environment steps (docs/experiments/first-design.md), and 40
-trials 11 hours on one core, 5.5 on two.
+RL takes 5 to 6 minutes a trial with 8,000 environment steps (docs/answers.md), and 40 trials 4
+hours on one core, 2 on two.
 """
 
 import contextlib

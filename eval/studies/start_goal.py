@@ -3,10 +3,10 @@
 The fixed start is the thesis's, all joints zero; the fixed goal is one place in the middle of the
 ring. Each policy plays all four combinations.
 
-Budget: on one core imitation takes 10 minutes a cell (4,000 optimiser steps on ``align-thesis``
-took 9, by the metadata of the shipped weights' result; here 2,500 and two rounds of DAgger), and RL
-16 with its base (16,000 environment steps took 10 to 14, docs/experiments/first-design.md); four
-times 100 scenes take 2. Four settings, both ways and three seeds: 6 hours on one core, 3 on two.
+Budget: on one core 8,000 environment steps with their evaluations took 5 to 6 minutes
+(docs/answers.md). Imitation, which begins with the eyes of the shipped weights, was not timed; 800
+steps and two rounds of DAgger are a quarter of what took 10 minutes for study D.1. Four times 100
+scenes take 2 to 4. Four settings, both ways and three seeds: some 4 hours on one core, 2 on two.
 """
 
 from typing import Any
