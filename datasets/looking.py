@@ -35,7 +35,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.datasets.expert import Expert
-from hvs_suite.datasets.leaning import on_spiral
+from hvs_suite.datasets.leaning import on_spiral, spiral_for
 from hvs_suite.datasets.planner import Planner
 from hvs_suite.registry import TASKS
 from hvs_suite.tasks.shared.family import GOAL_UNSEEN
@@ -128,7 +128,7 @@ class Demonstrator(Expert):
                 q, velocity, set_point, goal, spec.caught_mm, gently=bool(self._unseen().any())
             )
         if isinstance(spec, PanelSpec) and self._has_seen_closely:
-            around, is_near = on_spiral(goal, self._env.tip())
+            around, is_near = on_spiral(goal, self._env.tip(), spiral_for(spec), q)
             planner = self._near_planner if is_near else self._planner
             planner.avoid(self._env.obstacles)
             return planner.next_set_point(q, velocity, around)

@@ -18,7 +18,6 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.cell.kinematics import away_from_stops
-from hvs_suite.cell.robot import JOINT_ACCELERATION_RAD_S2
 from hvs_suite.cell.solid import Solid
 from hvs_suite.errors import PolicyError
 from hvs_suite.policies.servo.slope_estimate import SlopeEstimate
@@ -28,6 +27,7 @@ from hvs_suite.tasks.shared.detection import find_discs
 from hvs_suite.tasks.shared.goal import Goal
 from hvs_suite.tasks.shared.panels import OFF_CENTRE_M, SIDE_M
 from hvs_suite.tasks.shared.pattern_pose import Ring, axes
+from hvs_suite.tasks.shared.placing import are_near
 from hvs_suite.tasks.surface import SurfaceSpec
 
 FloatArray = npt.NDArray[np.float64]
@@ -41,8 +41,6 @@ _LEAN_RAD = math.radians(35.0)
 _FARTHER_M = 0.005
 """How much farther than the goal the eye is when it looks from the side (m)."""
 _N_SIDES = 10
-_DETOUR_RAD = 1.2
-"""A joint turns farther than this only where the arm has to take another shape."""
 _SURE_SHARE = 0.4
 """The standard deviation that is good enough, in tolerances."""
 _SURER = 0.7
@@ -176,25 +174,16 @@ class SlopedTargetServo(StillTargetServo):
             towards = math.cos(_LEAN_RAD) * normal + math.sin(_LEAN_RAD) * lean
             look = Goal(place, towards, self._standoff_m + _FARTHER_M)
             there = np.linalg.norm(p - look.position) < _THERE_M and -R[:, 2] @ towards > _THERE_COS
-            is_near = self._is_near(q, look, Goal(place, normal, self._standoff_m))
+            # A short motion leads to where to look from, and another one to the goal.
+            goal = Goal(place, normal, self._standoff_m)
+            embodiment = self._variant.embodiment
+            is_near = are_near(away_from_stops(q), look, goal, embodiment=embodiment)
             if is_near and not there:
                 break
             if not is_near:
                 self._turning = -self._turning
             self._side += self._turning * 2.0 * math.pi / _N_SIDES
         return look
-
-    def _is_near(self, q: FloatArray, look: Goal, goal: Goal) -> bool:
-        """Whether a short motion leads to where to look from, and another one to the goal."""
-        here = away_from_stops(q)
-        for there in (look, goal):
-            near = self._kinematics.nearest_configuration(
-                here, there.position, there.normal, JOINT_ACCELERATION_RAD_S2
-            )
-            if near is None or np.abs(near - here).max() > _DETOUR_RAD:
-                return False
-            here = near
-        return True
 
     def _over(self, position: FloatArray) -> Goal:
         """The goal of the flange at a place (3,) m, above all panels."""

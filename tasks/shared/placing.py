@@ -288,3 +288,28 @@ def is_reachable(goal: Goal, embodiment: Embodiment = BARE_ARM) -> bool:
         goal.position, goal.normal, 0.0
     )
     return bool(len(found))
+
+
+DETOUR_RAD = 1.2
+"""A joint turns farther than this only where the arm has to take another shape."""
+
+
+def are_near(q: FloatArray, *goals: Goal, embodiment: Embodiment = BARE_ARM) -> bool:
+    """Whether short motions lead from joint angles to one goal after the other.
+
+    Args:
+        q: Joint angles, (7,) rad.
+        goals: Where to go.
+        embodiment: What the arm carries.
+    """
+    from hvs_suite.cell.kinematics import kinematics
+    from hvs_suite.cell.robot import JOINT_ACCELERATION_RAD_S2
+
+    for goal in goals:
+        there = kinematics(embodiment).nearest_configuration(
+            q, goal.position, goal.normal, JOINT_ACCELERATION_RAD_S2
+        )
+        if there is None or np.abs(there - q).max() > DETOUR_RAD:
+            return False
+        q = there
+    return True
