@@ -4,7 +4,7 @@ What RL adds of its own, a potential and the cost of a step, is switched off: po
 the reward that the cell names, and from nothing else. Fine-tuning keeps the base where it did not
 become better, so a reward that harms shows as one that does not help.
 
-Budget: on one core 8,000 environment steps took 2.3 to 3.8 minutes and a base 0.4
+Budget: on one core 8,000 environment steps took 2.3 to 5.3 minutes and a base 0.4
 (docs/answers.md), evaluations and 100 scenes 2 more. Nine cells that learn, with three seeds, and
 their bases: 3 hours on one core, 1.5 on two.
 """
