@@ -93,6 +93,7 @@ def on_spiral(goal: Goal, tip: Tip, spiral: Spiral, q: FloatArray) -> tuple[Goal
     else:
         turned = math.atan2(-tip.axis @ y, -tip.axis @ x) + spiral.turn_rad
     side = math.cos(turned) * x + math.sin(turned) * y
+    follows = spiral.turn_rad is not None and share < 1.0
     for most in spiral.leans_rad:
         lean = most * min(share / spiral.upright_share, 1.0)
         around = dataclasses.replace(
@@ -100,7 +101,6 @@ def on_spiral(goal: Goal, tip: Tip, spiral: Spiral, q: FloatArray) -> tuple[Goal
             normal=math.cos(lean) * goal.normal + math.sin(lean) * side,
             standoff_m=goal.standoff_m + share * spiral.range_m,
         )
-        follows = spiral.turn_rad is not None and share < 1.0
         if are_near(q, around, goal) if follows else is_reachable(around):
             return around, share < 1.0
     return goal, share < 1.0

@@ -6,6 +6,7 @@ pixels, so the cells take 5 to 20 minutes on ``align-thesis`` and 8 to 30 on ``s
 whose episodes are longer: the 18 cells with two seeds about 10 hours on one core, 5 on two.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 from hvs_suite.eval.studies.grid import Cell, Plan
@@ -18,8 +19,6 @@ EFFORTS = {
 }
 NAMES = {"eih": "eye in hand", "eth": "eye to hand"}
 WHOLE = "both 112 px, colour"
-IN_COLOUR: dict[str, Any] = {}
-"""Settings of a policy that no camera shows in grey."""
 
 
 def plan(*, quick: bool = False) -> Plan:
@@ -28,28 +27,23 @@ def plan(*, quick: bool = False) -> Plan:
     Args:
         quick: Make everything in minutes, of next to no training.
     """
-    settings: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {WHOLE: ({}, ())}
+    settings: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {WHOLE: ({}, {})}
     for camera, name in NAMES.items():
         for side in (28, 56, 224):
-            settings[f"{name} {side} px"] = ({f"{camera}_resolution": side}, ())
+            settings[f"{name} {side} px"] = ({f"{camera}_resolution": side}, {})
     for camera, name in NAMES.items():
-        settings[f"{name} grey"] = ({}, (camera,))
-    settings["both grey"] = ({}, tuple(NAMES))
+        settings[f"{name} grey"] = ({}, {"grey": (camera,)})
+    settings["both grey"] = ({}, {"grey": tuple(NAMES)})
     cells = [
         Cell(
             group=task,
             name=name,
-            way=imitation(
-                task,
-                TRIAL if quick else effort,
-                options,
-                **({"grey": grey} if grey else IN_COLOUR),
-            ),
-            on=[Scenes(task=task, options={**options, **{f"{each}_channels": 1 for each in grey}})],
+            way=imitation(task, TRIAL if quick else effort, options, **learning),
+            on=[Scenes(task=task, options=options | _in_grey(learning.get("grey", ())))],
             against=None if name == WHOLE else WHOLE,
         )
         for task, effort in EFFORTS.items()
-        for name, (options, grey) in settings.items()
+        for name, (options, learning) in settings.items()
     ]
     return Plan(
         name="resolution",
@@ -58,3 +52,8 @@ def plan(*, quick: bool = False) -> Plan:
         seeds=1 if quick else 2,
         episodes=2 if quick else 200,
     )
+
+
+def _in_grey(cameras: Sequence[str]) -> dict[str, int]:
+    """Task options that show cameras in grey."""
+    return {f"{name}_channels": 1 for name in cameras}

@@ -42,6 +42,9 @@ if TYPE_CHECKING:
 
 FloatArray = npt.NDArray[np.float64]
 
+DETOUR_RAD = 1.2
+"""A joint turns farther than this only where the arm has to take another shape."""
+
 HARD: Mapping[str, Any] = MappingProxyType(
     {
         # A small disc leaves margin in a narrower view, which shows it larger.
@@ -288,10 +291,6 @@ def is_reachable(goal: Goal, embodiment: Embodiment = BARE_ARM) -> bool:
         goal.position, goal.normal, 0.0
     )
     return bool(len(found))
-
-
-DETOUR_RAD = 1.2
-"""A joint turns farther than this only where the arm has to take another shape."""
 
 
 def are_near(q: FloatArray, *goals: Goal, embodiment: Embodiment = BARE_ARM) -> bool:
