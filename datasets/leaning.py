@@ -1,4 +1,4 @@
-"""Coming down over a target on a spiral, so that the eye in the hand sees it from all sides.
+"""Coming down over a target so that the eye in the hand sees it from all sides.
 
 Pictures from one place are all wrong about a slope in the same way, so their mean is no better than
 one of them. Where slope and place have to be seen better than that, the demonstrator looks from all
@@ -21,7 +21,7 @@ FloatArray = npt.NDArray[np.float64]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Spiral:
-    """How the tool comes down around a target.
+    """Comes down once around the target: the height says where.
 
     Attributes:
         range_m: How far above the goal it begins.
@@ -29,81 +29,114 @@ class Spiral:
         ahead_m: How far below where the tool is the next place to go to lies (m): with too little
             it stops at each.
         upright_share: In this last part of the way down it straightens up.
-        turn_rad: How far around from where the tool leans the next place lies; with None the height
-            says where, once around in all.
     """
 
-    range_m: float
-    leans_rad: tuple[float, ...]
-    ahead_m: float
-    upright_share: float
-    turn_rad: float | None = None
+    range_m: float = 0.03
+    leans_rad: tuple[float, ...] = (math.radians(20.0), math.radians(10.0))
+    ahead_m: float = 0.003
+    upright_share: float = 0.3
+
+    def next_place(self, goal: Goal, tip: Tip, q: FloatArray) -> tuple[Goal, bool]:
+        """Where to go next on the way down.
+
+        Args:
+            goal: Where it ends.
+            tip: Where the tool is.
+            q: Joint angles, (7,) rad.
+
+        Returns:
+            A place around the target, or `goal` itself where it is near and where the arm reaches
+            no place that leans; and whether the way down has begun.
+        """
+        left_m = _left_m(goal, tip)
+        share = min((left_m - self.ahead_m) / self.range_m, 1.0)
+        if share <= 0.0:
+            return goal, True
+        for most in self.leans_rad:
+            lean = most * min(share / self.upright_share, 1.0)
+            around = _leaning(goal, lean, 2.0 * math.pi * share, share * self.range_m)
+            if is_reachable(around):
+                return around, share < 1.0
+        return goal, share < 1.0
 
 
-QUICK = Spiral(
-    range_m=0.03,
-    leans_rad=(math.radians(20.0), math.radians(10.0)),
-    ahead_m=0.003,
-    upright_share=0.3,
-)
-THOROUGH = Spiral(
-    range_m=0.06,
-    leans_rad=(math.radians(30.0), *QUICK.leans_rad),
-    ahead_m=0.004,
-    upright_share=0.13,
-    turn_rad=math.radians(40.0),
-)
-"""In 60 scenes of ``surface-hard`` 12 looks lean by more than 20 degrees where the quick one has 2,
-and an episode takes 42 steps where it takes 37. From the side a look says most of a slope
-(docs/experiments/looks-at-a-slope.md)."""
-QUICK_RAD = math.radians(0.4)
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Cone:
+    """Goes around the target from near by, leaning far, and straightens up step by step.
+
+    From the side a look says most of a slope, and the nearer the more. The tool arrives leaning,
+    and how far it leans says how much of the way is left: the more upright, the sooner it is.
+
+    Attributes:
+        leans_rad: How far it leans when it arrives: as far as the arm reaches, of these.
+        begin_m: How far above the goal it begins to go around.
+        above_m: How far above the goal it goes around.
+        turn_rad: How far around from where the tool leans the next place lies.
+        steady_rad: It goes on leaning as far as it does if that is so far.
+        growth: By what its lean is farther from that after a step.
+        upright_rad: Leaning less it goes straight to the goal, and stays so near to it.
+    """
+
+    leans_rad: tuple[float, ...] = tuple(math.radians(lean) for lean in (33.0, 30.0, 20.0, 10.0))
+    begin_m: float = 0.04
+    above_m: float = 0.006
+    turn_rad: float = math.radians(40.0)
+    steady_rad: float = math.radians(32.0)
+    growth: float = 1.17
+    upright_rad: float = math.radians(6.0)
+
+    def next_place(self, goal: Goal, tip: Tip, q: FloatArray) -> tuple[Goal, bool]:
+        """Where to go next on the way down; see `Spiral.next_place`."""
+        left_m = _left_m(goal, tip)
+        x, y = axes_across(goal.normal)
+        side_rad = math.atan2(-tip.axis @ y, -tip.axis @ x)
+        if left_m > self.begin_m:
+            for lean in self.leans_rad:
+                around = _leaning(goal, lean, side_rad, self.above_m)
+                if is_reachable(around):
+                    return around, left_m < _BESIDE_M
+            return goal, left_m < _BESIDE_M
+        lean = math.acos(float(np.clip(-tip.axis @ goal.normal, -1.0, 1.0)))
+        if lean > self.upright_rad:
+            most = self.steady_rad - self.growth * (self.steady_rad - lean)
+            above_m = self.above_m * min(lean / (2.0 * self.upright_rad), 1.0)
+            for share in (1.0, 0.8, 0.6):
+                farthest = share * min(most, self.leans_rad[0])
+                around = _leaning(goal, farthest, side_rad + self.turn_rad, above_m)
+                if are_near(q, around, goal):
+                    return around, True
+        return goal, True
+
+
+_BESIDE_M = 0.06
+"""So near to the goal, short ways lead to all sides."""
+_QUICK_RAD = math.radians(0.4)
 """A slope that need not be known better than this is seen well enough on the quick way down."""
 
 
-def spiral_for(spec: PanelSpec) -> Spiral:
-    """How to come down to the goals of a task.
+def way_down(spec: PanelSpec) -> Spiral | Cone:
+    """How to come down to the goals of a task: on a cone where the slope has to be known well.
 
     Args:
         spec: A slope that is off by more than its tolerance over its standoff loses the goal.
     """
     needed_rad = 1e-3 * spec.tightest_tolerance_mm / spec.standoff_m
-    return QUICK if needed_rad >= QUICK_RAD else THOROUGH
+    return Spiral() if needed_rad >= _QUICK_RAD else Cone()
 
 
-def on_spiral(goal: Goal, tip: Tip, spiral: Spiral, q: FloatArray) -> tuple[Goal, bool]:
-    """Where to go next on the way down to a goal.
+def _left_m(goal: Goal, tip: Tip) -> float:
+    return float(np.linalg.norm(tip.position - goal.target)) - goal.standoff_m
 
-    Args:
-        goal: Where the spiral ends.
-        tip: Where the tool is.
-        spiral: How it comes down.
-        q: Joint angles, (7,) rad.
 
-    Returns:
-        A place around the target, or `goal` itself where it is near and where the arm reaches no
-        place that leans; and whether the tip is on the spiral already.
-    """
-    left_m = float(np.linalg.norm(tip.position - goal.target)) - goal.standoff_m
-    share = min((left_m - spiral.ahead_m) / spiral.range_m, 1.0)
-    if share <= 0.0:
-        return goal, True
+def _leaning(goal: Goal, lean_rad: float, side_rad: float, above_m: float) -> Goal:
+    """A goal that faces the target from the side."""
     x, y = axes_across(goal.normal)
-    if spiral.turn_rad is None:
-        turned = 2.0 * math.pi * share
-    else:
-        turned = math.atan2(-tip.axis @ y, -tip.axis @ x) + spiral.turn_rad
-    side = math.cos(turned) * x + math.sin(turned) * y
-    follows = spiral.turn_rad is not None and share < 1.0
-    for most in spiral.leans_rad:
-        lean = most * min(share / spiral.upright_share, 1.0)
-        around = dataclasses.replace(
-            goal,
-            normal=math.cos(lean) * goal.normal + math.sin(lean) * side,
-            standoff_m=goal.standoff_m + share * spiral.range_m,
-        )
-        if are_near(q, around, goal) if follows else is_reachable(around):
-            return around, share < 1.0
-    return goal, share < 1.0
+    side = math.cos(side_rad) * x + math.sin(side_rad) * y
+    return dataclasses.replace(
+        goal,
+        normal=math.cos(lean_rad) * goal.normal + math.sin(lean_rad) * side,
+        standoff_m=goal.standoff_m + above_m,
+    )
 
 
 def axes_across(normal: FloatArray) -> tuple[FloatArray, FloatArray]:

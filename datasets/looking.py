@@ -19,8 +19,8 @@ second target the demonstrator looks from lower, and to those that follow it goe
 And where the arm may start anywhere, it goes there in one of two plain postures (see
 `hvs_suite.datasets.planner.Planner`).
 
-Over a surface of unknown slope it comes down on a spiral, so that the eye in the hand sees it from
-all sides (see `hvs_suite.datasets.leaning`).
+Over a surface of unknown slope it goes around on its way down, so that the eye in the hand sees it
+from all sides (see `hvs_suite.datasets.leaning`).
 
 Into a hole it goes down along a funnel (see `hvs_suite.datasets.insertion`). Where the hole is not
 where the pictures show it, nobody sees that, so it goes where they show it, and presses gently.
@@ -35,7 +35,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.datasets.expert import Expert
-from hvs_suite.datasets.leaning import on_spiral, spiral_for
+from hvs_suite.datasets.leaning import way_down
 from hvs_suite.datasets.planner import Planner
 from hvs_suite.registry import TASKS
 from hvs_suite.tasks.shared.family import GOAL_UNSEEN
@@ -128,7 +128,7 @@ class Demonstrator(Expert):
                 q, velocity, set_point, goal, spec.caught_mm, gently=bool(self._unseen().any())
             )
         if isinstance(spec, PanelSpec) and self._has_seen_closely:
-            around, is_near = on_spiral(goal, self._env.tip(), spiral_for(spec), q)
+            around, is_near = way_down(spec).next_place(goal, self._env.tip(), q)
             planner = self._near_planner if is_near else self._planner
             planner.avoid(self._env.obstacles)
             return planner.next_set_point(q, velocity, around)

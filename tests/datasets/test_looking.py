@@ -8,7 +8,7 @@ import hvs_suite
 from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.cell.robot import JOINT_SPEED_RAD_S
 from hvs_suite.datasets.expert import Expert
-from hvs_suite.datasets.leaning import QUICK, on_spiral
+from hvs_suite.datasets.leaning import Cone, Spiral
 from hvs_suite.datasets.looking import CLEARANCE_M, Demonstrator
 from hvs_suite.tasks.shared.goal import Goal, Tip
 from hvs_suite.tasks.shared.placing import is_reachable
@@ -168,19 +168,37 @@ def test_the_spiral_leads_around_the_target_and_ends_at_the_goal():
     goal = Goal(np.array([0.5, 0.0, 0.1]), np.array([0.0, 0.0, 1.0]), standoff_m=0.05)
     down = np.array([0.0, 0.0, -1.0])
     for height_m in np.linspace(0.2, 0.0, 50):
-        next_one, _ = on_spiral(
-            goal, Tip(goal.position + height_m * goal.normal, down), QUICK, np.zeros(7)
-        )
+        tip = Tip(goal.position + height_m * goal.normal, down)
+        next_one, _ = Spiral().next_place(goal, tip, np.zeros(7))
         assert (next_one.target == goal.target).all()
         assert np.degrees(np.arccos(min(next_one.normal[2], 1.0))) < 20.1
-        if height_m < QUICK.ahead_m:
+        if height_m < Spiral().ahead_m:
             assert next_one is goal
+
+
+def test_on_the_cone_the_next_place_is_further_around_and_the_more_upright_the_sooner():
+    goal = Goal(np.array([0.5, 0.0, 0.1]), np.array([0.0, 0.0, 1.0]), standoff_m=0.05)
+    q = np.array([0.0, 0.6, 0.0, -1.4, 0.0, 1.1, 0.0])
+    changes = []
+    for lean_deg in (30.0, 20.0, 10.0):
+        lean = np.radians(lean_deg)
+        away = np.array([np.sin(lean), 0.0, np.cos(lean)])
+        at = kinematics().nearest_configuration(q, goal.target + 0.056 * away, away, np.ones(7))
+        next_one, has_begun = Cone().next_place(goal, Tip(goal.target + 0.056 * away, -away), at)
+        assert has_begun
+        x, y, z = next_one.normal
+        assert np.degrees(np.arctan2(y, x)) == pytest.approx(40.0)
+        changes.append(np.degrees(np.arccos(z)) - lean_deg)
+    assert 0.0 > changes[0] > changes[1] > changes[2]
+    upright, _ = Cone().next_place(goal, Tip(goal.position, np.array([0.0, 0.0, -1.0])), at)
+    assert upright is goal
 
 
 def test_where_the_arm_cannot_lean_it_goes_straight_down():
     far = Goal(np.array([0.79, 0.0, 0.1]), np.array([0.0, 0.0, 1.0]), standoff_m=0.05)
     assert is_reachable(far)
-    next_one, _ = on_spiral(
-        far, Tip(far.position + 0.1 * far.normal, -far.normal), QUICK, np.zeros(7)
-    )
-    assert next_one is far
+    for way in (Spiral(), Cone()):
+        next_one, _ = way.next_place(
+            far, Tip(far.position + 0.1 * far.normal, -far.normal), np.zeros(7)
+        )
+        assert next_one is far
