@@ -37,7 +37,8 @@ def test_recipe_is_a_command_that_hvs_takes(task):
     assert command.task == task
     # Policies are scored on the test split, so none is trained on it.
     assert command.split == "train"
-    dataset_features(hvs_suite.TASKS[task].with_options({"start": command.start}))
+    start = {} if command.start is None else {"start": command.start}
+    dataset_features(hvs_suite.TASKS[task].with_options(start))
 
 
 def test_the_sample_is_of_its_tasks_present_meaning():
