@@ -12,8 +12,6 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from hvs_suite.policies.belief.slope import SlopeEye
-
 FEATURE_SIZE = 28
 """Cells along the side of a feature map, about."""
 PATCH_SIZE = 8
@@ -82,7 +80,7 @@ class Eye(nn.Module):
         side: Side of the image (px).
         channels: Channels of the features.
         n_goals: Length of the one-hot vector that says which target is meant; 0 for none.
-        slopes: Tell slopes by image moments.
+        slope: What tells slopes of what it sees; None where it has to do so by its features.
 
     Attributes:
         channels: Channels of the features.
@@ -93,7 +91,13 @@ class Eye(nn.Module):
     train_in_bfloat16 = False
 
     def __init__(
-        self, in_channels: int, side: int, channels: int, n_goals: int = 0, *, slopes: bool = False
+        self,
+        in_channels: int,
+        side: int,
+        channels: int,
+        n_goals: int = 0,
+        *,
+        slope: nn.Module | None = None,
     ) -> None:
         super().__init__()
         self.channels = channels
@@ -126,7 +130,7 @@ class Eye(nn.Module):
         self.points = nn.Linear(channels, N_POINTS)
         n_around = PATCH_CHANNELS * PATCH_SIZE**2 + 4 * N_POINTS
         self.judge = nn.Sequential(nn.Linear(2 * channels + n_around + 5, 128), nn.SiLU(), last)
-        self.slope = SlopeEye(in_channels, side) if slopes else None
+        self.slope = slope
 
     def forward(self, images: Tensor, goal: Tensor | None = None) -> Tensor:
         """Look.

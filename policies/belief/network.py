@@ -14,6 +14,7 @@ teach something.
 import dataclasses
 import math
 from collections.abc import Mapping
+from typing import Literal
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -33,9 +34,11 @@ from hvs_suite.policies.belief.belief import (
     Prior,
     View,
 )
+from hvs_suite.policies.belief.colour_slope import ColourSlopeEye
 from hvs_suite.policies.belief.eye import LOG_DIAMETER, UV, VISIBLE, Eye, Seen
 from hvs_suite.policies.belief.geometry import FlangeMotion
 from hvs_suite.policies.belief.residual import RESIDUAL_SIZE, SHIFT, Residual, goal_axes
+from hvs_suite.policies.belief.slope import SlopeEye
 
 N_JOINTS = 7
 ACTION_UNITS = 2.0**20
@@ -102,9 +105,11 @@ class Shape:
         reads_positions: Whether measured joint positions are read; without them the network knows
             where the arm starts, and from there on where it has sent it.
         reads_velocities: Whether measured joint velocities are read; without them they count as 0.
-        slopes: Cameras whose eyes tell slopes by image moments, see
-            `hvs_suite.policies.belief.slope`. With any, the head may let the tool lean about the
-            target.
+        slopes: Cameras whose eyes tell slopes by image moments. With any, the head may let the tool
+            lean about the target.
+        slopes_by: What these are the moments of: ``contrasts`` of the picture
+            (`hvs_suite.policies.belief.slope`), or what has the target's ``colour``
+            (`hvs_suite.policies.belief.colour_slope`).
         offsets: Cameras whose pose is not exact, and of which the belief finds out how they are
             shifted and turned.
     """
@@ -121,6 +126,7 @@ class Shape:
     reads_positions: bool = True
     reads_velocities: bool = True
     slopes: tuple[str, ...] = ()
+    slopes_by: Literal["contrasts", "colour"] = "contrasts"
     offsets: tuple[str, ...] = ()
 
 
@@ -178,7 +184,7 @@ class BeliefNetwork(nn.Module):
         cameras = tuple(shape.cameras)
         self.eyes = nn.ModuleDict(
             {
-                n: Eye(c, side, shape.channels, shape.n_goals, slopes=n in shape.slopes)
+                n: Eye(c, side, shape.channels, shape.n_goals, slope=self._slope_eye(n))
                 for n, (c, side) in shape.cameras.items()
             }
         )
@@ -479,6 +485,15 @@ class BeliefNetwork(nn.Module):
         mean = (weights.softmax(dim=1)[:, :, None] * torch.stack(proposals, dim=1)).sum(dim=1)
         total = torch.asinh(mean / scale) + torch.sigmoid(is_corrected) * correction
         return Decision(total, torch.stack(said, dim=1), weights)
+
+    def _slope_eye(self, camera: str) -> SlopeEye | ColourSlopeEye | None:
+        """What tells the slopes that a camera sees; None for its eye's own features."""
+        if camera not in self.shape.slopes:
+            return None
+        channels, side = self.shape.cameras[camera]
+        if self.shape.slopes_by == "colour":
+            return ColourSlopeEye(side, self.cell.tan[camera])
+        return SlopeEye(channels, side)
 
     def _joints(self, memory: Tensor, q: Tensor) -> Tensor:
         """Joint positions as the network knows them, (B, 7) rad: measured, or reckoned."""

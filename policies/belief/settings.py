@@ -90,6 +90,7 @@ class Settings(pydantic.BaseModel):
         reads_positions: See `Shape`.
         reads_velocities: See `Shape`.
         slopes: See `Shape`.
+        slopes_by: See `Shape`.
         offsets: See `Shape`.
     """
 
@@ -111,6 +112,7 @@ class Settings(pydantic.BaseModel):
     reads_positions: Annotated[bool, pydantic.Field(strict=True)] = True
     reads_velocities: Annotated[bool, pydantic.Field(strict=True)] = True
     slopes: tuple[Literal["eih", "eth"], ...] = ()
+    slopes_by: Literal["contrasts", "colour"] = "contrasts"
     offsets: tuple[Literal["eih", "eth"], ...] = ()
 
     @pydantic.model_validator(mode="after")
@@ -167,6 +169,7 @@ class Settings(pydantic.BaseModel):
             reads_positions=self.reads_positions,
             reads_velocities=self.reads_velocities,
             slopes=self.slopes,
+            slopes_by=self.slopes_by,
             offsets=self.offsets,
         )
 

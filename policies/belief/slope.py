@@ -44,6 +44,8 @@ LEAST_DIAMETER = 0.005
 """Smaller targets count as this large (image widths)."""
 LEAST_SPREAD = 0.003
 """What varies less is not raised to the others' scale."""
+PASSES = 30
+"""Passes of a judge over all frames."""
 RECENT = 100
 """Batches over which means and spreads are averaged, about."""
 
@@ -71,6 +73,7 @@ class SlopeEye(nn.Module):
         side: Side of the image (px).
     """
 
+    passes = PASSES
     contrasts: Tensor
     mean: Tensor
     variance: Tensor
@@ -84,8 +87,12 @@ class SlopeEye(nn.Module):
         self.register_buffer("mean", torch.zeros(n))
         self.register_buffer("variance", torch.ones(n))
         self.register_buffer("n_batches", torch.tensor(0.0))
-        self.judge = new_judge(n + 3)
+        self.judge = self.new_judge()
         self._side, self._window = side, min(side, MOST_PX)
+
+    def new_judge(self) -> nn.Sequential:
+        """A fresh network from numbers to a slope and its doubt."""
+        return new_judge(len(self.mean) + 3)
 
     def forward(self, images: Tensor, uv: Tensor, log_diameter: Tensor, counts: Tensor) -> Tensor:
         """Look.

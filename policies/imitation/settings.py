@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from hvs_suite.datasets.features import IMAGES, STATE
 from hvs_suite.datasets.metadata import EXPERT
@@ -180,6 +180,7 @@ def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":
         reads_positions=settings.reads("joint_positions"),
         reads_velocities=settings.reads("joint_velocities"),
         slopes=settings.slopes,
+        slopes_by="colour",
         offsets=settings.offsets,
         **trained_for(task).model_dump(),
     )
@@ -232,11 +233,21 @@ def take_eyes(policy: "HvsPolicy", folder: Path) -> None:
             "sides and channels"
         )
     for name in alike:
-        eyes[name].load_state_dict(others[name].state_dict(), strict=False)
+        eyes[name].load_state_dict(_layers(others[name], eyes[name]), strict=False)
 
 
 def _fits(eye: nn.Module, other: nn.Module) -> bool:
     """Whether all layers that both eyes have are alike; one alone may be told what is meant."""
-    mine, theirs = eye.state_dict(), other.state_dict()
+    mine, theirs = eye.state_dict(), _layers(other, eye)
     common = mine.keys() & theirs.keys()
     return bool(common) and all(mine[name].shape == theirs[name].shape for name in common)
+
+
+def _layers(other: nn.Module, eye: nn.Module) -> dict[str, Tensor]:
+    """The layers of another eye, without those for slopes if this one tells them otherwise."""
+    is_alike = type(other.slope) is type(eye.slope)
+    return {
+        name: value
+        for name, value in other.state_dict().items()
+        if is_alike or not name.startswith("slope.")
+    }

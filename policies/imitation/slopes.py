@@ -13,13 +13,13 @@ from collections.abc import Iterator, Mapping, Sequence
 import torch
 from torch import Tensor, nn
 
+from hvs_suite.policies.belief.colour_slope import ColourSlopeEye, TurningJudge
 from hvs_suite.policies.belief.eye import LOG_SIGMA_SLOPE, SLOPE, VISIBLE, Eye, doubt
 from hvs_suite.policies.belief.network import BeliefNetwork
-from hvs_suite.policies.belief.slope import SlopeEye, new_judge
+from hvs_suite.policies.belief.slope import SlopeEye
 
 FACING = slice(SLOPE.start, LOG_SIGMA_SLOPE.stop)
 """The part of a sighting that the judge says."""
-PASSES = 30
 BATCH = 256
 LEARNING_RATE = 2e-3
 GRADIENT_NORM = 1.0
@@ -75,30 +75,33 @@ def fit_judges(
                 sighting[:, FACING] = eye.judge(measured).cpu()
 
 
-def _slope_eyes(network: BeliefNetwork) -> dict[str, SlopeEye]:
+def _slope_eyes(network: BeliefNetwork) -> dict[str, SlopeEye | ColourSlopeEye]:
     """What tells slopes by image moments, by camera name."""
     return {
         name: eye.slope
         for name, eye in network.eyes.items()
-        if isinstance(eye, Eye) and eye.slope is not None
+        if isinstance(eye, Eye) and isinstance(eye.slope, SlopeEye | ColourSlopeEye)
     }
 
 
-def _fit(eye: SlopeEye, numbers: Tensor, facing: Tensor) -> None:
+def _fit(eye: SlopeEye | ColourSlopeEye, numbers: Tensor, facing: Tensor) -> None:
     """Replace an eye's judge by one that learned from numbers (n, k) to say slopes (n, 2)."""
-    n_steps = math.ceil(PASSES * len(numbers) / BATCH)
+    n_steps = math.ceil(eye.passes * len(numbers) / BATCH)
     # What comes out is to be a function of what was measured alone: a killed run fits it again.
     generator = torch.Generator().manual_seed(0)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        eye.judge.load_state_dict(new_judge(numbers.shape[1]).state_dict())
+        eye.judge.load_state_dict(eye.new_judge().state_dict())
     optimizer = torch.optim.AdamW(eye.judge.parameters(), LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, n_steps)
     with torch.enable_grad():
         for _ in range(n_steps):
             rows = torch.randint(len(numbers), (BATCH,), generator=generator).to(numbers.device)
-            said = eye.judge(numbers[rows])
-            loss = doubt(said[:, :2] - facing[rows], said[:, 2:]).mean()
+            given, true = numbers[rows], facing[rows]
+            if isinstance(eye.judge, TurningJudge):
+                given, true = eye.judge.turned(given, true, generator)
+            said = eye.judge(given)
+            loss = doubt(said[:, :2] - true, said[:, 2:]).mean()
             optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             nn.utils.clip_grad_norm_(eye.judge.parameters(), GRADIENT_NORM)

@@ -270,6 +270,7 @@ DAMAGES: dict[str, Damage] = {
             "error_scale": [None, "small", 0, -1.0],
             "residual_hidden": [None, -3, 2**40, 64],
             "slopes": [None, ["top"], ["eih"]],
+            "slopes_by": [None, "size", ["colour"]],
             "offsets": [None, ["top"], ["eth"], ["eth", "eth"]],
         }.items()
         for value in values
