@@ -41,7 +41,7 @@ class HvsConfig(PreTrainedConfig):
         reads_positions: Whether it reads measured joint positions, see `Shape`.
         reads_velocities: Whether it reads measured joint velocities.
         slopes: Cameras whose eyes tell slopes by image moments, see `Shape`.
-        slopes_by: See `Shape`; new policies tell them by colour.
+        slopes_by: See `Shape`; ``hvs pretrain`` makes it ``colour``.
         offsets: Cameras whose pose is not exact, see `Shape`.
         family: Family of the tasks that it was trained for.
         control_period_s: Length of their control step (s).

@@ -1,6 +1,8 @@
 """Eyes that tell slopes by the shape of what has the target's colour."""
 
+import dataclasses
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -10,6 +12,9 @@ from hvs_suite.policies.belief.cell_model import cell_model
 from hvs_suite.policies.belief.colour_slope import ColourSlopeEye
 from hvs_suite.policies.belief.eye import SLOPE
 from hvs_suite.policies.belief.network import BeliefNetwork, Shape
+from hvs_suite.policies.catalogue import checkpoint_folder
+from hvs_suite.policies.checkpoints.loading import load_network
+from hvs_suite.policies.imitation.settings import take_eyes
 from hvs_suite.policies.imitation.slopes import fit_judges, measuring
 from hvs_suite.registry import find
 
@@ -138,3 +143,16 @@ def test_targets_out_of_view_do_not_count_for_the_scales(eye: ColourSlopeEye, n_
     told = eye.train()(torch.rand(4, 3, SIDE, SIDE) - 0.5, uv, size, counts)
     torch.testing.assert_close((eye.mean, eye.variance), before)
     assert told.isfinite().all()
+
+
+def test_eyes_begin_with_those_that_told_slopes_otherwise() -> None:
+    folder = checkpoint_folder("pretrained", "surface-fuselage")
+    other = load_network(folder)
+    torch.manual_seed(0)
+    network = BeliefNetwork(dataclasses.replace(other.shape, slopes_by="colour"), other.cell)
+    told = network.eyes["eih"].slope.judge.layers[0].weight.clone()
+    take_eyes(SimpleNamespace(network=network), folder)
+    torch.testing.assert_close(
+        network.eyes["eih"].features[0].weight, other.eyes["eih"].features[0].weight
+    )
+    torch.testing.assert_close(network.eyes["eih"].slope.judge.layers[0].weight, told)
