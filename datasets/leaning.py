@@ -65,15 +65,15 @@ class Cone:
     """Goes around the target from near by, leaning far, and straightens up step by step.
 
     From the side a look says most of a slope, and the nearer the more. The tool arrives leaning,
-    and how far it leans says how much of the way is left: the more upright, the sooner it is.
+    and how far it leans says how much of the way is left: the more upright, the less.
 
     Attributes:
         leans_rad: How far it leans when it arrives: as far as the arm reaches, of these.
         begin_m: How far above the goal it begins to go around.
         above_m: How far above the goal it goes around.
         turn_rad: How far around from where the tool leans the next place lies.
-        steady_rad: It goes on leaning as far as it does if that is so far.
-        growth: By what its lean is farther from that after a step.
+        steady_rad: A lean that stays as it is from step to step.
+        growth: By what factor a lean is farther from that one after a step.
         upright_rad: Leaning less it goes straight to the goal, and stays so near to it.
     """
 
