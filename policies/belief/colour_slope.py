@@ -18,7 +18,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from hvs_suite.policies.belief.slope import LEAST, LEAST_SPREAD, RECENT, SLOPE_SIZE
+from hvs_suite.policies.belief.slope import LEAST, LEAST_SPREAD, RECENT, new_judge
 
 CORE = 0.3
 AROUND = 1.6
@@ -230,17 +230,7 @@ class TurningJudge(nn.Module):
         super().__init__()
         self._n_plain, self._tan = n_plain, tan
         self.register_buffer("orders", torch.tensor(orders, dtype=torch.float32), persistent=False)
-        last = nn.Linear(HIDDEN // 2, SLOPE_SIZE)
-        nn.init.zeros_(last.weight)
-        with torch.no_grad():
-            last.bias.copy_(torch.tensor([0.0, 0.0, -1.0]))
-        self.layers = nn.Sequential(
-            nn.Linear(n_plain + 2 * len(orders), HIDDEN),
-            nn.SiLU(),
-            nn.Linear(HIDDEN, HIDDEN // 2),
-            nn.SiLU(),
-            last,
-        )
+        self.layers = new_judge(n_plain + 2 * len(orders), HIDDEN)
 
     def forward(self, numbers: Tensor) -> Tensor:
         """Judge.

@@ -35,7 +35,6 @@ ORDER = 3
 PARTS = tuple((a, b) for a in range(ORDER + 1) for b in range(ORDER + 1 - a) if a + b)
 SLOPE_SIZE = 3
 HIDDEN = 128
-"""Width of the first layer; the second has half of it."""
 MOST_PX = 112
 """Of an image, only a square of this side around the target is looked at."""
 LEAST = 1e-3
@@ -50,18 +49,19 @@ RECENT = 100
 """Batches over which means and spreads are averaged, about."""
 
 
-def new_judge(n_numbers: int) -> nn.Sequential:
+def new_judge(n_numbers: int, hidden: int = HIDDEN) -> nn.Sequential:
     """A fresh network from numbers to a slope and its doubt.
 
     Args:
         n_numbers: That it is given.
+        hidden: Width of the first layer; the second has half of it.
     """
-    last = nn.Linear(HIDDEN // 2, SLOPE_SIZE)
+    last = nn.Linear(hidden // 2, SLOPE_SIZE)
     nn.init.zeros_(last.weight)
     with torch.no_grad():
         last.bias.copy_(torch.tensor([0.0, 0.0, -1.0]))
     return nn.Sequential(
-        nn.Linear(n_numbers, HIDDEN), nn.SiLU(), nn.Linear(HIDDEN, HIDDEN // 2), nn.SiLU(), last
+        nn.Linear(n_numbers, hidden), nn.SiLU(), nn.Linear(hidden, hidden // 2), nn.SiLU(), last
     )
 
 
