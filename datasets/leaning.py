@@ -36,6 +36,14 @@ class Spiral:
     ahead_m: float = 0.003
     upright_share: float = 0.3
 
+    def arrival(self, goal: Goal) -> Goal:
+        """Where to look at the target from before the way down, above or at its first place.
+
+        Args:
+            goal: Where the way down ends, or as far above it as the target is to be looked at from.
+        """
+        return goal
+
     def next_place(self, goal: Goal, tip: Tip, q: FloatArray) -> tuple[Goal, bool]:
         """Where to go next on the way down.
 
@@ -85,17 +93,27 @@ class Cone:
     growth: float = 1.17
     upright_rad: float = math.radians(6.0)
 
+    def arrival(self, goal: Goal) -> Goal:
+        """Where it begins to go around; see `Spiral.arrival`.
+
+        It leans across the direction to the base: there the arm reaches farthest to both sides. A
+        side that depended on where the arm came from would depend on how the surface slopes, which
+        is not seen before.
+        """
+        side_rad = math.atan2(-goal.target[0], goal.target[1])
+        for lean in self.leans_rad:
+            around = _leaning(goal, lean, side_rad, self.above_m)
+            if is_reachable(around):
+                return around
+        return goal
+
     def next_place(self, goal: Goal, tip: Tip, q: FloatArray) -> tuple[Goal, bool]:
         """Where to go next on the way down; see `Spiral.next_place`."""
         left_m = _left_m(goal, tip)
+        if left_m > self.begin_m:
+            return self.arrival(goal), left_m < _BESIDE_M
         x, y = axes_across(goal.normal)
         side_rad = math.atan2(-tip.axis @ y, -tip.axis @ x)
-        if left_m > self.begin_m:
-            for lean in self.leans_rad:
-                around = _leaning(goal, lean, side_rad, self.above_m)
-                if is_reachable(around):
-                    return around, left_m < _BESIDE_M
-            return goal, left_m < _BESIDE_M
         lean = math.acos(float(np.clip(-tip.axis @ goal.normal, -1.0, 1.0)))
         if lean > self.upright_rad:
             most = self.steady_rad - self.growth * (self.steady_rad - lean)

@@ -127,8 +127,12 @@ class Demonstrator(Expert):
             return self._insertion.learnable_set_point(
                 q, velocity, set_point, goal, spec.caught_mm, gently=bool(self._unseen().any())
             )
-        if isinstance(spec, PanelSpec) and self._has_seen_closely:
-            around, is_near = way_down(spec).next_place(goal, self._env.tip(), q)
+        if isinstance(spec, PanelSpec):
+            way, around, is_near = way_down(spec), goal, False
+            if self._has_seen_closely:
+                around, is_near = way.next_place(goal, self._env.tip(), q)
+            else:
+                around = way.arrival(goal)
             planner = self._near_planner if is_near else self._planner
             planner.avoid(self._env.obstacles)
             return planner.next_set_point(q, velocity, around)
