@@ -1,9 +1,9 @@
-"""Coming down over a target so that the eye in the hand sees it from all sides.
+"""Coming down over a target so that the eye in the hand sees how its surface slopes.
 
 Pictures from one place are all wrong about a slope in the same way, so their mean is no better than
-one of them. Where slope and place have to be seen better than that, the demonstrator looks from all
-sides on its way down. Where it goes next depends on where it is, and on nothing else, so a learner
-needs no memory of where it has looked from.
+one of them. Where slope and place have to be seen better than that, the demonstrator looks from
+many places on its way down. Where it goes next depends on where it is and on what can be known
+there, and on nothing else, so a learner needs no memory of where it has looked from.
 """
 
 import dataclasses
@@ -36,14 +36,6 @@ class Spiral:
     ahead_m: float = 0.003
     upright_share: float = 0.3
 
-    def arrival(self, goal: Goal) -> Goal:
-        """Where to look at the target from before the way down, above or at its first place.
-
-        Args:
-            goal: Where the way down ends, or as far above it as the target is to be looked at from.
-        """
-        return goal
-
     def next_place(self, goal: Goal, tip: Tip, q: FloatArray) -> tuple[Goal, bool]:
         """Where to go next on the way down.
 
@@ -69,18 +61,17 @@ class Spiral:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Cone:
-    """Goes around the target from near by, leaning far, and straightens up step by step.
+class Straightening:
+    """Arrives leaning far, near by, and straightens up step by step.
 
-    From the side a look says most of a slope, and the nearer the more. The tool arrives leaning,
-    and how far it leans says how much of the way is left: the more upright, the less.
+    From the side a look says most of a slope, and the nearer the more. How far the tool leans says
+    how much of the way is left: the more upright, the less.
 
     Attributes:
         leans_rad: How far it leans when it arrives: as far as the arm reaches, of these.
-        begin_m: How far above the goal it begins to go around.
-        above_m: How far above the goal it goes around.
-        turn_rad: How far around from where the tool leans the next place lies.
-        steady_rad: A lean that stays as it is from step to step.
+        begin_m: How far above the goal it begins to straighten up.
+        above_m: How far above the goal it does so.
+        steady_rad: A lean that would stay as it is from step to step.
         growth: By what factor a lean is farther from that one after a step.
         upright_rad: Leaning less it goes straight to the goal, and stays so near to it.
     """
@@ -88,39 +79,31 @@ class Cone:
     leans_rad: tuple[float, ...] = tuple(math.radians(lean) for lean in (33.0, 30.0, 20.0, 10.0))
     begin_m: float = 0.04
     above_m: float = 0.006
-    turn_rad: float = math.radians(40.0)
-    steady_rad: float = math.radians(32.0)
-    growth: float = 1.17
+    steady_rad: float = math.radians(36.0)
+    growth: float = 1.15
     upright_rad: float = math.radians(6.0)
 
-    def arrival(self, goal: Goal) -> Goal:
-        """Where it begins to go around; see `Spiral.arrival`.
-
-        It leans across the direction to the base: there the arm reaches farthest to both sides. A
-        side that depended on where the arm came from would depend on how the surface slopes, which
-        is not seen before.
-        """
-        side_rad = math.atan2(-goal.target[0], goal.target[1])
-        for lean in self.leans_rad:
-            around = _leaning(goal, lean, side_rad, self.above_m)
-            if is_reachable(around):
-                return around
-        return goal
-
     def next_place(self, goal: Goal, tip: Tip, q: FloatArray) -> tuple[Goal, bool]:
-        """Where to go next on the way down; see `Spiral.next_place`."""
+        """Where to go next on the way down; see `Spiral.next_place`.
+
+        It leans to the base, in the plane of a plain posture. A side that depended on where the arm
+        came from would depend on how the surface slopes, which is not seen before.
+        """
         left_m = _left_m(goal, tip)
+        side_rad = math.atan2(-goal.target[1], -goal.target[0])
         if left_m > self.begin_m:
-            return self.arrival(goal), left_m < _BESIDE_M
-        x, y = axes_across(goal.normal)
-        side_rad = math.atan2(-tip.axis @ y, -tip.axis @ x)
+            for lean in self.leans_rad:
+                around = _leaning(goal, lean, side_rad, self.above_m)
+                if is_reachable(around):
+                    return around, left_m < _BESIDE_M
+            return goal, left_m < _BESIDE_M
         lean = math.acos(float(np.clip(-tip.axis @ goal.normal, -1.0, 1.0)))
         if lean > self.upright_rad:
             most = self.steady_rad - self.growth * (self.steady_rad - lean)
             above_m = self.above_m * min(lean / (2.0 * self.upright_rad), 1.0)
             for share in (1.0, 0.8, 0.6):
                 farthest = share * min(most, self.leans_rad[0])
-                around = _leaning(goal, farthest, side_rad + self.turn_rad, above_m)
+                around = _leaning(goal, farthest, side_rad, above_m)
                 if are_near(q, around, goal):
                     return around, True
         return goal, True
@@ -132,14 +115,14 @@ _QUICK_RAD = math.radians(0.4)
 """A slope that need not be known better than this is seen well enough on the quick way down."""
 
 
-def way_down(spec: PanelSpec) -> Spiral | Cone:
-    """How to come down to the goals of a task: on a cone where the slope has to be known well.
+def way_down(spec: PanelSpec) -> Spiral | Straightening:
+    """How to come down to the goals of a task: leaning far where the slope has to be known well.
 
     Args:
         spec: A slope that is off by more than its tolerance over its standoff loses the goal.
     """
     needed_rad = 1e-3 * spec.tightest_tolerance_mm / spec.standoff_m
-    return Spiral() if needed_rad >= _QUICK_RAD else Cone()
+    return Spiral() if needed_rad >= _QUICK_RAD else Straightening()
 
 
 def _left_m(goal: Goal, tip: Tip) -> float:

@@ -19,8 +19,8 @@ second target the demonstrator looks from lower, and to those that follow it goe
 And where the arm may start anywhere, it goes there in one of two plain postures (see
 `hvs_suite.datasets.planner.Planner`).
 
-Over a surface of unknown slope it goes around on its way down, so that the eye in the hand sees it
-from all sides (see `hvs_suite.datasets.leaning`).
+Over a surface of unknown slope it goes around, or leans, on its way down, so that the eye in the
+hand sees the slope (see `hvs_suite.datasets.leaning`).
 
 Into a hole it goes down along a funnel (see `hvs_suite.datasets.insertion`). Where the hole is not
 where the pictures show it, nobody sees that, so it goes where they show it, and presses gently.
@@ -127,12 +127,8 @@ class Demonstrator(Expert):
             return self._insertion.learnable_set_point(
                 q, velocity, set_point, goal, spec.caught_mm, gently=bool(self._unseen().any())
             )
-        if isinstance(spec, PanelSpec):
-            way, around, is_near = way_down(spec), goal, False
-            if self._has_seen_closely:
-                around, is_near = way.next_place(goal, self._env.tip(), q)
-            else:
-                around = way.arrival(goal)
+        if isinstance(spec, PanelSpec) and self._has_seen_closely:
+            around, is_near = way_down(spec).next_place(goal, self._env.tip(), q)
             planner = self._near_planner if is_near else self._planner
             planner.avoid(self._env.obstacles)
             return planner.next_set_point(q, velocity, around)

@@ -8,7 +8,7 @@ import hvs_suite
 from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.cell.robot import JOINT_SPEED_RAD_S
 from hvs_suite.datasets.expert import Expert
-from hvs_suite.datasets.leaning import Cone, Spiral
+from hvs_suite.datasets.leaning import Spiral, Straightening
 from hvs_suite.datasets.looking import CLEARANCE_M, Demonstrator
 from hvs_suite.tasks.shared.goal import Goal, Tip
 from hvs_suite.tasks.shared.placing import is_reachable
@@ -176,29 +176,48 @@ def test_the_spiral_leads_around_the_target_and_ends_at_the_goal():
             assert next_one is goal
 
 
-def test_on_the_cone_the_next_place_is_further_around_and_the_more_upright_the_sooner():
+@pytest.mark.parametrize("side_deg", [120.0, 180.0, 240.0])
+def test_the_tool_straightens_up_towards_the_base_and_the_more_upright_the_sooner(side_deg):
     goal = Goal(np.array([0.5, 0.0, 0.1]), np.array([0.0, 0.0, 1.0]), standoff_m=0.05)
+    side = np.radians(side_deg)
     q = np.array([0.0, 0.6, 0.0, -1.4, 0.0, 1.1, 0.0])
     changes = []
     for lean_deg in (30.0, 20.0, 10.0):
         lean = np.radians(lean_deg)
-        away = np.array([np.sin(lean), 0.0, np.cos(lean)])
+        away = np.array([np.sin(lean) * np.cos(side), np.sin(lean) * np.sin(side), np.cos(lean)])
         at = kinematics().nearest_configuration(q, goal.target + 0.056 * away, away, np.ones(7))
-        next_one, has_begun = Cone().next_place(goal, Tip(goal.target + 0.056 * away, -away), at)
+        tip = Tip(goal.target + 0.056 * away, -away)
+        next_one, has_begun = Straightening().next_place(goal, tip, at)
         assert has_begun
         x, y, z = next_one.normal
-        assert np.degrees(np.arctan2(y, x)) == pytest.approx(40.0)
+        assert (x, y) == pytest.approx((-np.sqrt(1.0 - z**2), 0.0))
         changes.append(np.degrees(np.arccos(z)) - lean_deg)
     assert 0.0 > changes[0] > changes[1] > changes[2]
-    upright, _ = Cone().next_place(goal, Tip(goal.position, np.array([0.0, 0.0, -1.0])), at)
+    upright, _ = Straightening().next_place(
+        goal, Tip(goal.position, np.array([0.0, 0.0, -1.0])), at
+    )
     assert upright is goal
 
 
-def test_where_the_arm_cannot_lean_it_goes_straight_down():
-    far = Goal(np.array([0.79, 0.0, 0.1]), np.array([0.0, 0.0, 1.0]), standoff_m=0.05)
-    assert is_reachable(far)
-    for way in (Spiral(), Cone()):
-        next_one, _ = way.next_place(
-            far, Tip(far.position + 0.1 * far.normal, -far.normal), np.zeros(7)
-        )
-        assert next_one is far
+def test_it_arrives_leaning_to_the_same_side_wherever_it_comes_from():
+    goal = Goal(np.array([0.4, 0.4, 0.1]), np.array([0.0, 0.0, 1.0]), standoff_m=0.05)
+    arrivals = []
+    for lean_deg in (-30.0, 0.0, 30.0):
+        away = np.array([np.sin(np.radians(lean_deg)), 0.0, np.cos(np.radians(lean_deg))])
+        tip = Tip(goal.target + 0.3 * away, -away)
+        arrival, has_begun = Straightening().next_place(goal, tip, np.zeros(7))
+        assert not has_begun
+        assert np.degrees(np.arccos(arrival.normal[2])) == pytest.approx(33.0)
+        arrivals.append(arrival.normal)
+    np.testing.assert_allclose(arrivals, [arrivals[0]] * 3)
+    assert arrivals[0][0] == pytest.approx(arrivals[0][1])
+    assert arrivals[0][0] < 0.0
+
+
+@pytest.mark.parametrize(("way", "x_m"), [(Spiral(), 0.79), (Straightening(), 0.4)])
+def test_where_the_arm_cannot_lean_it_goes_straight_down(way, x_m):
+    goal = Goal(np.array([x_m, 0.0, 0.1]), np.array([0.0, 0.0, 1.0]), standoff_m=0.05)
+    assert is_reachable(goal)
+    above = Tip(goal.position + 0.1 * goal.normal, -goal.normal)
+    next_one, _ = way.next_place(goal, above, np.zeros(7))
+    assert next_one is goal
