@@ -199,6 +199,7 @@ def _draw_map(axes: Any, rows: Sequence[Row]) -> None:
         for x, rate in enumerate(line):
             colour = "white" if rate > 60.0 else "black"
             axes.text(x, y, f"{rate:.0f}", ha="center", va="center", fontsize=8, color=colour)
-    axes.set_xticks(range(len(scenes)), scenes, fontsize=8)
+    # On one line, long names of neighbours touch.
+    axes.set_xticks(range(len(scenes)), [name.replace(", ", ",\n") for name in scenes], fontsize=8)
     axes.set_yticks(range(len(names)), names, fontsize=8)
     axes.set_xlabel("played with; solved (%)", fontsize=8)
