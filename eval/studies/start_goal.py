@@ -3,10 +3,8 @@
 The fixed start is the thesis's, all joints zero; the fixed goal is one place in the middle of the
 ring. Each policy plays all four combinations.
 
-Budget: on one core 8,000 environment steps with their evaluations took 5 to 6 minutes
-(docs/answers.md). Imitation, which begins with the eyes of the shipped weights, was not timed; 800
-steps and two rounds of DAgger are a quarter of what took 10 minutes for study D.1. Four times 100
-scenes take 2 to 4. Four settings, both ways and three seeds: some 4 hours on one core, 2 on two.
+Budget: one seed of all took 47 minutes on one core, beside other work (docs/answers.md): three
+seeds 2.4 hours, 1.2 on two.
 """
 
 from typing import Any
