@@ -50,7 +50,7 @@ def table(rows: Sequence[Row]) -> list[str]:
         "played": [row.scenes for row in rows],
         "solved": [f"{row.rate:.1f} %" for row in rows],
         "95 % interval": [f"{row.interval[0]:.1f} to {row.interval[1]:.1f} %" for row in rows],
-        "each seed": [", ".join(f"{rate:.1f}" for rate in row.rates) for row in rows],
+        "each seed": [", ".join(f"{rate:.4g}" for rate in row.rates) for row in rows],
         "collisions": [str(sum(each.n_collision for each in row.judged)) for row in rows],
         "steps": [_mean([each.steps_to_goal for each in row.judged], 1) for row in rows],
         f"settled {rows[0].judged[0].metric}": [
