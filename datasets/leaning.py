@@ -36,6 +36,10 @@ class Spiral:
     ahead_m: float = 0.003
     upright_share: float = 0.3
 
+    def above(self, goal: Goal, height_m: float) -> Goal:
+        """So far above a goal (m), and facing it."""
+        return dataclasses.replace(goal, standoff_m=goal.standoff_m + height_m)
+
     def next_place(self, goal: Goal, tip: Tip, q: FloatArray) -> tuple[Goal, bool]:
         """Where to go next on the way down.
 
@@ -77,7 +81,7 @@ class Straightening:
     """
 
     leans_rad: tuple[float, ...] = tuple(math.radians(lean) for lean in (33.0, 30.0, 20.0, 10.0))
-    begin_m: float = 0.04
+    begin_m: float = 0.015
     above_m: float = 0.006
     steady_rad: float = math.radians(36.0)
     growth: float = 1.15
@@ -86,27 +90,31 @@ class Straightening:
     def next_place(self, goal: Goal, tip: Tip, q: FloatArray) -> tuple[Goal, bool]:
         """Where to go next on the way down; see `Spiral.next_place`.
 
-        It leans to the base, in the plane of a plain posture. A side that depended on where the arm
-        came from would depend on how the surface slopes, which is not seen before.
+        It leans away from the base, in the plane of a plain posture. A side that depended on where
+        the arm came from would depend on how the surface slopes, which is not seen before. And
+        leaning to the base the wrist is nearly straight, where a little of slope turns it by much.
         """
         left_m = _left_m(goal, tip)
-        side_rad = math.atan2(-goal.target[1], -goal.target[0])
         if left_m > self.begin_m:
-            for lean in self.leans_rad:
-                around = _leaning(goal, lean, side_rad, self.above_m)
-                if is_reachable(around):
-                    return around, left_m < _BESIDE_M
-            return goal, left_m < _BESIDE_M
+            return self.above(goal, self.above_m), left_m < _BESIDE_M
         lean = math.acos(float(np.clip(-tip.axis @ goal.normal, -1.0, 1.0)))
         if lean > self.upright_rad:
             most = self.steady_rad - self.growth * (self.steady_rad - lean)
             above_m = self.above_m * min(lean / (2.0 * self.upright_rad), 1.0)
             for share in (1.0, 0.8, 0.6):
                 farthest = share * min(most, self.leans_rad[0])
-                around = _leaning(goal, farthest, side_rad, above_m)
+                around = _leaning(goal, farthest, _outward_rad(goal), above_m)
                 if are_near(q, around, goal):
                     return around, True
         return goal, True
+
+    def above(self, goal: Goal, height_m: float) -> Goal:
+        """So far above a goal (m), leaning as far as the arm reaches."""
+        for lean in self.leans_rad:
+            around = _leaning(goal, lean, _outward_rad(goal), height_m)
+            if is_reachable(around):
+                return around
+        return dataclasses.replace(goal, standoff_m=goal.standoff_m + height_m)
 
 
 _BESIDE_M = 0.06
@@ -123,6 +131,11 @@ def way_down(spec: PanelSpec) -> Spiral | Straightening:
     """
     needed_rad = 1e-3 * spec.tightest_tolerance_mm / spec.standoff_m
     return Spiral() if needed_rad >= _QUICK_RAD else Straightening()
+
+
+def _outward_rad(goal: Goal) -> float:
+    """To which side of a target the way from the base goes on (rad)."""
+    return math.atan2(goal.target[1], goal.target[0])
 
 
 def _left_m(goal: Goal, tip: Tip) -> float:

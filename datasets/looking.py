@@ -139,7 +139,9 @@ class Demonstrator(Expert):
         goal = dataclasses.replace(goal, target=goal.target - self._unseen())
         if self._has_seen_closely:
             return goal
-        height = LOOK_DOWN_M[self._n_compared]
+        spec, height = self._env.spec, LOOK_DOWN_M[self._n_compared]
+        if isinstance(spec, PanelSpec):
+            return way_down(spec).above(goal, height)
         return dataclasses.replace(goal, standoff_m=goal.standoff_m + height)
 
     def _unseen(self) -> FloatArray:

@@ -80,7 +80,8 @@ class Eye(nn.Module):
         side: Side of the image (px).
         channels: Channels of the features.
         n_goals: Length of the one-hot vector that says which target is meant; 0 for none.
-        slope: What tells slopes of what it sees; None where it has to do so by its features.
+        slope: What tells slopes of what it sees, and learns it by itself; None where the features
+            have to do so.
 
     Attributes:
         channels: Channels of the features.
@@ -168,10 +169,9 @@ class Eye(nn.Module):
         # A mark that is cut by the image's border has its centre elsewhere than what is in view.
         uv, size = uv + judged[:, UV], size + judged[:, LOG_DIAMETER]
         facing = judged[:, SLOPE.start :]
-        if self.slope is not None:
+        if self.slope is not None and not self.training:
             bright = images.float() / 255.0 if images.dtype == torch.uint8 else images
-            counts = (judged[:, VISIBLE] > 0.0) & (uv.abs().amax(dim=1, keepdim=True) < 1.0)
-            facing = self.slope(bright - 0.5, uv.detach(), size.detach(), counts)
+            facing = self.slope(bright - 0.5, uv, size)
         return Seen(torch.cat([uv, size, judged[:, 3 : SLOPE.start], facing], dim=1), scores)
 
     def attention(self, images: Tensor, goal: Tensor | None = None) -> Tensor:

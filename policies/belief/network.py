@@ -50,6 +50,11 @@ HEIGHTS_M = (0.0, 0.05, 0.15)
 """Above the goal, along its normal: the plain postures that the head is shown."""
 MOST_LEAN = 1.0
 """Tangent of the angle by which the head may let the tool lean to a side."""
+ARRIVES_LEANING = math.tan(math.radians(33.0))
+LEANING_HEIGHTS_M = (0.006, 0.15)
+"""Where slopes are to be seen, the head is also shown plain postures that lean away from the base,
+by this tangent, and stand so far above the goal. Demonstrations that look from the side come down
+so (`hvs_suite.datasets.leaning.Straightening`)."""
 RECENT_SIZE = 4
 """What is remembered beside belief and set point: for how long each camera has not seen the target
 (two), and a trace of what was forgotten (two)."""
@@ -205,12 +210,14 @@ class BeliefNetwork(nn.Module):
         width += 2 * 8  # arm and set point in the goal's frame
         width += shape.n_felt * 2
         self.width = width
-        n_ways = len(HEIGHTS_M)
+        n_ways = len(HEIGHTS_M) + self._sees_slopes * len(LEANING_HEIGHTS_M)
         way_width = n_ways * (2 * (N_JOINTS - 1) + 2)
         # To which point by the goal: sideways (two) and along the normal, how far ahead, and what
         # is added for where the tip is, and where it was sent.
-        # With slopes to see, also how far to lean to either side of the base frame.
-        guide_last = nn.Linear(128, 8 if shape.slopes else 6)
+        # With slopes to see, also how far to lean to either side of the base frame, and how much of
+        # the lean to keep.
+        n_leans = 3 if self._sees_slopes else 2 if shape.slopes else 0
+        guide_last = nn.Linear(128, 6 + n_leans)
         nn.init.zeros_(guide_last.weight)
         nn.init.zeros_(guide_last.bias)
         self.guide = nn.Sequential(
@@ -450,18 +457,20 @@ class BeliefNetwork(nn.Module):
         waypoint = waypoint + gain[:, 1:] * (ahead - sent.position)
         facing = normal.detach()
         if self.shape.slopes:
-            facing = _leaning(facing, MOST_LEAN * torch.tanh(guided[:, 6:]))
+            facing = _leaning(facing, MOST_LEAN * torch.tanh(guided[:, 6:8]))
+            if self._sees_slopes:
+                tool = -here.rotation[:, :, 2]
+                across = tool - (tool * facing).sum(dim=1, keepdim=True) * facing
+                facing = F.normalize(facing + 2.0 * torch.tanh(guided[:, 8:]) * across, dim=1)
             # About the target, so that it stays in view.
             reach = self.belief.standoff.float() + by[:, 2:]
             waypoint = waypoint + reach * (facing - normal.detach())
         proposals = [arm.joint_step(sent, waypoint - sent.position, facing)]
         joints, velocity = self._moving(memory, state)
         ways = []
-        tool = self.cell.tool_length_m
         ahead_s = self.cell.period_s + self.cell.lead_s
-        for height in HEIGHTS_M:
-            over = (ahead + (height + tool) * normal).detach()
-            turns, time_s, within = arm.way_to_posture(joints, over, normal.detach())
+        for over, faced in self._postures(ahead.detach(), normal.detach()):
+            turns, time_s, within = arm.way_to_posture(joints, over, faced)
             gone = arm.along_way(turns, velocity[:, :-1], ahead_s)
             step = gone + (joints - set_point)[:, :-1]
             proposals.append(F.pad(step, (0, 1)))
@@ -485,6 +494,31 @@ class BeliefNetwork(nn.Module):
         mean = (weights.softmax(dim=1)[:, :, None] * torch.stack(proposals, dim=1)).sum(dim=1)
         total = torch.asinh(mean / scale) + torch.sigmoid(is_corrected) * correction
         return Decision(total, torch.stack(said, dim=1), weights)
+
+    def _postures(self, goal: Tensor, normal: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Where the plain postures that the head is shown have the flange, and what they face.
+
+        Args:
+            goal: Of the tip, (B, 3) m.
+            normal: Of the surface, (B, 3).
+
+        Returns:
+            Place (B, 3) m and unit normal (B, 3) of each.
+        """
+        tool = self.cell.tool_length_m
+        places = [(goal + (height + tool) * normal, normal) for height in HEIGHTS_M]
+        if self._sees_slopes:
+            standoff = self.belief.standoff.float()
+            target = goal - standoff * normal
+            leaning = _leaning(normal, ARRIVES_LEANING * F.normalize(target[:, :2], dim=1))
+            for height in LEANING_HEIGHTS_M:
+                places.append((target + (standoff + height + tool) * leaning, leaning))
+        return places
+
+    @property
+    def _sees_slopes(self) -> bool:
+        """Whether the head may look from the side."""
+        return bool(self.shape.slopes) and self.shape.slopes_by == "colour"
 
     def _slope_eye(self, camera: str) -> SlopeEye | ColourSlopeEye | None:
         """What tells the slopes that a camera sees; None for its eye's own features."""

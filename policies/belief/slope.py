@@ -94,15 +94,13 @@ class SlopeEye(nn.Module):
         """A fresh network from numbers to a slope and its doubt."""
         return new_judge(len(self.mean) + 3)
 
-    def forward(self, images: Tensor, uv: Tensor, log_diameter: Tensor, counts: Tensor) -> Tensor:
+    def forward(self, images: Tensor, uv: Tensor, log_diameter: Tensor) -> Tensor:
         """Look.
 
         Args:
             images: (B, C, H, W), float in [-0.5, 0.5].
             uv: The target's centre in [-1, 1], u right and v down, (B, 2).
             log_diameter: Logarithm of its apparent diameter in image widths, (B, 1).
-            counts: Whether it is in view: in training, what is not leaves means and spreads as they
-                are, (B, 1) bool.
 
         Returns:
             x and y of the surface's normal in the camera's optical frame, and the logarithm of
@@ -111,8 +109,6 @@ class SlopeEye(nn.Module):
         uv = uv.clamp(-1.2, 1.2)
         diameter = log_diameter.exp().clamp(LEAST_DIAMETER, 1.0)
         numbers = self._moments(images, uv, diameter)
-        if self.training:
-            self._take_in(numbers.detach(), counts)
         alike = (numbers - self.mean) * torch.rsqrt(self.variance + LEAST_SPREAD**2)
         # A target that is cut or not there gives numbers that no other has.
         alike = alike.clamp(-10.0, 10.0)
@@ -154,16 +150,3 @@ class SlopeEye(nn.Module):
         total = moments[..., 0, 0]
         shares = [moments[..., a, b] / (total + LEAST) for a, b in PARTS]
         return torch.stack([torch.log(total + LEAST), *shares], dim=3).flatten(1)
-
-    def _take_in(self, numbers: Tensor, counts: Tensor) -> None:
-        """Means and spreads follow those of a batch."""
-        weight = counts.to(numbers.dtype)
-        n = weight.sum()
-        if n < 2:
-            return
-        mean = (numbers * weight).sum(dim=0) / n
-        variance = ((numbers - mean).square() * weight).sum(dim=0) / n
-        self.n_batches += 1.0
-        share = 1.0 / self.n_batches.clamp(max=float(RECENT))
-        self.mean += share * (mean - self.mean)
-        self.variance += share * (variance - self.variance)

@@ -64,6 +64,11 @@ class Demonstrations:
         on_frames: OnFrames | None = None,
     ) -> None:
         columns = read_columns(manifest)
+        n = manifest.n_frames
+        if episodes is not None:
+            last = np.unique(columns[EPISODE])[episodes - 1]
+            n = int(np.searchsorted(columns[EPISODE], last, "right"))
+            columns = {key: column[:n] for key, column in columns.items()}
         self.manifest = manifest
         self._recordings: list[Recording] = []
         self._starts: npt.NDArray[np.int64] = np.zeros(0, np.int64)
@@ -76,14 +81,8 @@ class Demonstrations:
                     f"{manifest.root}: {key} is video; train on the lossless recording instead"
                 )
             images[key] = cached_frames(
-                manifest.root, key, shape, manifest.n_frames, cache, on_frames
+                manifest.root, key, shape, manifest.n_frames, cache, on_frames, first=n
             )
-        if episodes is not None:
-            # The cache holds them all, the columns say how many there are.
-            n = np.searchsorted(
-                columns[EPISODE], np.unique(columns[EPISODE])[episodes - 1], "right"
-            )
-            columns = {key: column[:n] for key, column in columns.items()}
         self._append(Recording(columns, images))
         owner = columns[EPISODE]
         names = np.unique(owner)
@@ -142,26 +141,39 @@ class Demonstrations:
         """
         # Neighbours on disk together: the same rows, fewer page faults.
         indices = np.sort(indices)
-        owner = np.searchsorted(self._starts, indices, side="right") - 1
-        parts = [
-            (self._recordings[i], indices[owner == i] - self._starts[i]) for i in np.unique(owner)
-        ]
-        first = self._recordings[0]
+        parts = self._parts(indices)
         batch = {
             key: torch.from_numpy(np.concatenate([r.columns[key][rows] for r, rows in parts]))
-            for key in first.columns
+            for key in self._recordings[0].columns
             if key != EPISODE
         }
-        for key, frames in first.images.items():
-            images = torch.empty((len(indices), *frames.shape[1:]), dtype=torch.uint8)
-            begin = 0
-            for recording, rows in parts:
-                end = begin + len(rows)
-                read_rows(recording.images[key], rows, images[begin:end].numpy())
-                begin = end
-            # (B, H, W, C) stays the layout in memory, which is what the convolutions want.
-            batch[key] = images.permute(0, 3, 1, 2)
-        return batch
+        return batch | {key: self.pictures(key, indices) for key in self._recordings[0].images}
+
+    def pictures(self, key: str, indices: npt.NDArray[np.int64]) -> Tensor:
+        """Images of one camera, (B, C, H, W) uint8.
+
+        Args:
+            key: Of the images.
+            indices: Of the frames, ascending, (B,).
+        """
+        shape = self._recordings[0].images[key].shape[1:]
+        images = torch.empty((len(indices), *shape), dtype=torch.uint8)
+        begin = 0
+        for recording, rows in self._parts(indices):
+            end = begin + len(rows)
+            read_rows(recording.images[key], rows, images[begin:end].numpy())
+            begin = end
+        # (B, H, W, C) stays the layout in memory, which is what the convolutions want.
+        return images.permute(0, 3, 1, 2)
+
+    def _parts(
+        self, indices: npt.NDArray[np.int64]
+    ) -> list[tuple[Recording, npt.NDArray[np.int64]]]:
+        """Which rows of which recordings frames in ascending order are."""
+        owner = np.searchsorted(self._starts, indices, side="right") - 1
+        return [
+            (self._recordings[i], indices[owner == i] - self._starts[i]) for i in np.unique(owner)
+        ]
 
     def weights(self) -> npt.NDArray[np.float64]:
         """How often to draw from each episode, (n,), in sum 1.

@@ -43,6 +43,8 @@ def cached_frames(
     n_frames: int,
     folder: Path,
     on_frames: OnFrames | None = None,
+    *,
+    first: int | None = None,
 ) -> Frames:
     """Open the frames of one camera, decoding them first if the cache is not of this dataset.
 
@@ -53,9 +55,10 @@ def cached_frames(
         n_frames: Frames in the dataset.
         folder: Where the cache lives; made if missing.
         on_frames: Called with the number of frames just decoded.
+        first: Open the first so many alone; None for all.
 
     Returns:
-        (n_frames, H, W, C) uint8, memory-mapped and read-only.
+        (n, H, W, C) uint8, memory-mapped and read-only.
 
     Raises:
         DatasetError: A frame is missing, cannot be decoded, or has another size.
@@ -64,7 +67,8 @@ def cached_frames(
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{key}.npy"
     made_from = folder / f"{key}.json"
-    stamp = {"dataset": fingerprint(root), "shape": [n_frames, *shape]}
+    wanted = n_frames if first is None else first
+    stamp = {"dataset": fingerprint(root), "shape": [wanted, *shape]}
     # A half-written cache has no stamp, because the stamp is written last.
     with contextlib.suppress(DatasetError):
         if read_json(made_from, error=DatasetError, within=folder) == stamp:
@@ -75,9 +79,11 @@ def cached_frames(
         made_from.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"cannot replace {made_from}: {error.strerror}") from error
-    frames: Any = new_frames(path, (n_frames, *shape))
+    frames: Any = new_frames(path, (wanted, *shape))
     done = 0
     for stored in _stored(root, key):
+        if done == wanted < n_frames:
+            break
         if done >= n_frames:
             raise DatasetError(f"{root} holds more than the {n_frames} frames that it declares")
         try:
@@ -88,7 +94,7 @@ def cached_frames(
         done += 1
         if on_frames is not None and done % ROWS_AT_ONCE == 0:
             on_frames(ROWS_AT_ONCE)
-    if done != n_frames:
+    if done != wanted:
         raise DatasetError(f"{root} declares {n_frames} frames but holds {done}; record it again")
     frames.flush()
     del frames

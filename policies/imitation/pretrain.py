@@ -56,7 +56,7 @@ class Progress:
     """How a run is doing.
 
     Attributes:
-        stage: ``decoding``, ``training`` or ``playing``.
+        stage: ``decoding``, ``training``, ``learning slopes`` or ``playing``.
         share: Part of the stage that is done, 0 to 1.
         step: Optimiser steps done.
         frames: Frames decoded, played or trained on in this sitting.
@@ -226,7 +226,8 @@ class _Run:
 
     def decode(self, manifest: Manifest, cache: Path, settings: Settings) -> Demonstrations:
         """Open the dataset, decoding its frames unless the cache has them."""
-        total = manifest.n_frames * max(1, len(manifest.cameras))
+        share = (settings.episodes or manifest.n_episodes) / max(1, manifest.n_episodes)
+        total = share * manifest.n_frames * max(1, len(manifest.cameras))
         started = time.perf_counter()
         demonstrations = Demonstrations(
             manifest,
@@ -278,9 +279,7 @@ class _Run:
                 step = self._counters.step
                 teacher.advance(share)
                 if teacher.is_due:
-                    teacher.look_again()
-                    self._checkpoint(teacher, optimizer, state, curves)
-                    teacher.keep()
+                    self._look_again(teacher, optimizer, state, curves)
                 step_rate = rate * _schedule(share)
                 for group in optimizer.param_groups:
                     group["lr"] = step_rate
@@ -303,6 +302,9 @@ class _Run:
                     self._checkpoint(teacher, optimizer, state, curves)
                     last_checkpoint = time.perf_counter()
                 self._report_training(self._share(budget), begun)
+            teacher.advance(1.0)
+            if settings.eye_share == 1.0 and settings.slopes and teacher.is_due:
+                self._look_again(teacher, optimizer, state, curves)
             self._checkpoint(teacher, optimizer, state, curves)
         finally:
             curves.close()
@@ -385,6 +387,13 @@ class _Run:
         )
         self._reopen(demonstrations, folder)
 
+    def _look_again(
+        self, teacher: Teacher, optimizer: torch.optim.Optimizer, state: Path, curves: Curves
+    ) -> None:
+        teacher.look_again(self._meter)
+        self._checkpoint(teacher, optimizer, state, curves)
+        teacher.keep()
+
     def _checkpoint(
         self, teacher: Teacher, optimizer: torch.optim.Optimizer, state: Path, curves: Curves
     ) -> None:
@@ -394,7 +403,7 @@ class _Run:
         save_state(state, teacher.policy, optimizer, self._counters)
         teacher.save(self._out)
 
-    def _meter(self, stage: str, total: int) -> Callable[[int], None]:
+    def _meter(self, stage: str, total: float) -> Callable[[int], None]:
         """Counts the frames of a stage and reports its rate and time left."""
         started = time.perf_counter()
         done = 0

@@ -13,6 +13,7 @@ from hvs_suite.datasets.features import IMAGES, STATE
 from hvs_suite.datasets.metadata import EXPERT
 from hvs_suite.errors import DatasetError, OptionError, PolicyError
 from hvs_suite.policies.belief.cell_model import cell_model
+from hvs_suite.policies.belief.colour_slope import ColourSlopeEye
 from hvs_suite.policies.belief.eye import Eye
 from hvs_suite.policies.belief.settings import as_numbers, further_keys
 from hvs_suite.policies.checkpoints.loading import load_network, weights_digest
@@ -194,6 +195,8 @@ def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":
     for eye in policy.network.eyes.values():
         assert isinstance(eye, Eye)
         eye.train_in_bfloat16 = torch.cpu._is_avx512_bf16_supported()
+        if isinstance(eye.slope, ColourSlopeEye):
+            eye.slope.judge.train_in_bfloat16 = eye.train_in_bfloat16
     return policy
 
 

@@ -23,6 +23,7 @@ from hvs_suite.policies.belief.recorded import recorded, recorded_keys
 from hvs_suite.policies.imitation.dagger import round_shares
 from hvs_suite.policies.imitation.demonstrations import Demonstrations
 from hvs_suite.policies.imitation.settings import Settings
+from hvs_suite.policies.imitation.slopes import Meter
 from hvs_suite.policies.imitation.windows import Rows, WindowPool
 from hvs_suite.policies.training.dataset import EPISODE
 
@@ -107,16 +108,19 @@ class Teacher:
         if kept is not None:
             self._looked_in, self._due = self._part(kept)[0], _next_due(kept)
 
-    def look_again(self) -> None:
+    def look_again(self, meter: Meter | None = None) -> None:
         """Look at all frames once in each part of the training; recall all episodes.
 
         This takes too long for every step; the result is a function of the weights. It may change
         them, see `WindowPool.look`, so `keep` it once they are written.
+
+        Args:
+            meter: Reports how far it is.
         """
         network = self.policy.network
         self.policy.eval()
         if self._at > self._looked_in:
-            self._windows.look(network)
+            self._windows.look(network, meter)
         else:
             self._windows.recall(network)
         self.policy.train()

@@ -10,7 +10,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from hvs_suite.datasets.features import ACTION, STATE
+from hvs_suite.datasets.features import ACTION, IMAGES, STATE
 from hvs_suite.files import replacing
 from hvs_suite.policies.belief.eye import (
     LOG_DIAMETER,
@@ -24,7 +24,7 @@ from hvs_suite.policies.belief.lessons import Window, facing, remembered
 from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
 from hvs_suite.policies.belief.recorded import Recorded, recorded
 from hvs_suite.policies.imitation.demonstrations import Demonstrations
-from hvs_suite.policies.imitation.slopes import fit_judges, measuring
+from hvs_suite.policies.imitation.slopes import Meter, learn_slopes
 
 JITTER = 0.35
 """Eyes err more on pictures that they did not learn from: by so many of their own standard
@@ -60,16 +60,17 @@ class WindowPool:
         """Frames that the eyes have looked at."""
         return 0 if self._memory is None else len(self._memory)
 
-    def look(self, network: BeliefNetwork) -> None:
+    def look(self, network: BeliefNetwork, meter: Meter | None = None) -> None:
         """Have the eyes look at every frame, and the belief go through every episode.
 
-        Eyes that tell slopes by image moments learn from those of all frames then.
+        Those that tell slopes learn from all frames then.
 
         Args:
             network: In evaluation mode.
+            meter: Reports how far the learning is.
         """
         seen: dict[str, list[Tensor]] = {name: [] for name in network.shape.cameras}
-        with torch.no_grad(), measuring(network) as numbers:
+        with torch.no_grad():
             for first in range(0, len(self._demonstrations), BATCH):
                 rows = np.arange(first, min(first + BATCH, len(self._demonstrations)))
                 batch = self._demonstrations.batch(rows)
@@ -78,13 +79,14 @@ class WindowPool:
         self._sightings = {name: torch.cat(parts) for name, parts in seen.items()}
         self._memory = None
         self._open(network)
-        fit_judges(
+        learn_slopes(
             network,
-            numbers,
+            lambda camera, rows: self._demonstrations.pictures(IMAGES + camera, rows),
             self._sightings,
             facing(network, self._columns[STATE][:, :N_JOINTS], self._truth),
             {name: target[:, 3] > 0.0 for name, target in self._truth.targets.items()},
             torch.from_numpy(self._demonstrations.training),
+            meter,
         )
         self.recall(network)
 

@@ -177,12 +177,12 @@ def check_compiled(folder):
     torch.testing.assert_close(fast, slow, atol=1e-6, rtol=0)
 
 
-def test_eyes_of_chosen_cameras_tell_slopes_by_moments(dataset, tmp_path):
+def test_eyes_of_chosen_cameras_tell_slopes_by_themselves(dataset, tmp_path):
     pretrain(dataset, tmp_path / "out", slopes=("eih",), **STEP)
     assert json.loads((tmp_path / "out/config.json").read_text())["slopes"] == ["eih"]
-    moments = [name for name in weights(tmp_path / "out") if name.endswith(".slope.mean")]
-    assert len(moments) == 1
-    assert ".eih." in moments[0]
+    judges = [name for name in weights(tmp_path / "out") if name.endswith(".slope.n_lessons")]
+    assert len(judges) == 1
+    assert ".eih." in judges[0]
     check_compiled(tmp_path / "out")
     with pytest.raises(OptionError, match="unknown camera 'top'"):
         pretrain(dataset, tmp_path / "other", slopes=("top",), **STEP)
@@ -198,6 +198,18 @@ def test_eyes_can_learn_alone(dataset, tmp_path):
     changed = {name for name in after if (after[name] != before[name]).any()}
     assert changed
     assert all(".eyes." in name for name in changed)
+
+
+def test_eyes_alone_learn_slopes_once_they_have_found_the_target(dataset, tmp_path):
+    options = {"steps": 2, "batch_size": 4, "eye_share": 1.0, "slopes": ("eih",)}
+    pretrain(dataset, tmp_path / "out", **options)
+    first = weights(tmp_path / "out")
+    [lessons] = [value for name, value in first.items() if name.endswith("eih.slope.n_lessons")]
+    assert lessons == 1
+    # The same command finds that all is done.
+    pretrain(dataset, tmp_path / "out", **options)
+    again = weights(tmp_path / "out")
+    assert all((again[name] == value).all() for name, value in first.items())
 
 
 def test_how_far_off_a_camera_is_can_be_part_of_the_belief(dataset, tmp_path):

@@ -10,6 +10,7 @@ import hvs_suite
 from hvs_suite.datasets.features import STATE, observed_part
 from hvs_suite.datasets.looking import Demonstrator
 from hvs_suite.policies.belief import arm
+from hvs_suite.policies.belief.belief import PLACE, TILT
 from hvs_suite.policies.belief.cell_model import cell_model
 from hvs_suite.policies.belief.eye import SIGHTING_SIZE
 from hvs_suite.policies.belief.geometry import flange_motion
@@ -38,6 +39,35 @@ def test_an_arm_that_sees_nothing_is_shown_the_way_to_where_it_looks_from() -> N
         time_step = env.step(action[0].numpy())
         steps += 1
     assert steps > 3
+
+
+def test_a_head_that_sees_slopes_is_shown_the_way_to_where_the_tool_leans() -> None:
+    env = hvs_suite.load("surface-hard", split="dev", observations="state")
+    cameras = {"eih": (3, 112), "eth": (3, 512)}
+    shape = Shape(cameras, hidden=8, slopes=("eih",), slopes_by="colour")
+    network = BeliefNetwork(shape, cell_model(env.spec))
+    demonstrator = Demonstrator(env)
+    time_step = env.reset(scenario=0)
+    goal = env.goal()
+    network.belief.standoff.fill_(goal.standoff_m)
+    memory, unseen = network.start(1), {n: torch.zeros(1, SIGHTING_SIZE) for n in cameras}
+    steps = 0
+    while np.linalg.norm(env.tip().position - goal.position) > 0.05:
+        state = torch.from_numpy(observed_part(env.spec, time_step.observation, env)[STATE])[None]
+        action = torch.from_numpy(np.asarray(demonstrator.label(), np.float32))[None]
+        with torch.no_grad():
+            memory = network.remember(memory, unseen, state[:, :7])
+            memory[:, PLACE] = torch.tensor(goal.target)
+            memory[:, TILT] = torch.tensor(goal.normal[:2] / goal.normal[2])
+            proposals = network.decide(memory, unseen, state).proposals[0]
+        label = network.encode_label(action, memory)[0]
+        off = (network.to_step(proposals) - network.to_step(label)).abs().amax(dim=1)
+        assert off.min() < 1e-3, (steps, off)
+        memory = network.commanded(memory, action)
+        time_step = env.step(action[0].numpy())
+        steps += 1
+    assert steps > 10
+    assert -env.tip().axis @ goal.normal < math.cos(math.radians(30.0))
 
 
 def test_no_zero_has_a_sign_because_logs_are_twice_as_long_with_it() -> None:
