@@ -18,6 +18,9 @@ if platform.machine() in ("x86_64", "AMD64"):
     # every processor with AVX2. NumPy reads the variable when it loads. A value that the user has
     # set stays.
     os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
+# Two threads of torch wait for each other by spinning, for which they need the cores that other
+# programs would use, and get them late: beside another training, one took ten times as long.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 from hvs_suite.gym import register
 from hvs_suite.registry import TASKS, load

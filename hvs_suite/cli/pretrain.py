@@ -47,8 +47,8 @@ class Pretrain(Players):
         window_steps: Length of each.
         eye_share: Part of the training in which the eyes learn; in the rest belief and head do,
             from what the eyes see. With 1 nothing but eyes comes out, for --eyes of another run.
-        slopes: Cameras whose eyes tell the slope of the surface by image moments, joined by +; for
-            surfaces that lean.
+        slopes: Cameras whose eyes tell the slope of the surface, joined by +; for surfaces that
+            lean.
         offsets: Cameras whose pose is not exact, joined by +: the belief finds out how they are
             shifted and turned; for targets in sequence.
         batch_size: Frames that the eyes learn from in a step.

@@ -110,10 +110,10 @@ class Shape:
         reads_positions: Whether measured joint positions are read; without them the network knows
             where the arm starts, and from there on where it has sent it.
         reads_velocities: Whether measured joint velocities are read; without them they count as 0.
-        slopes: Cameras whose eyes tell slopes by image moments. With any, the head may let the tool
-            lean about the target.
-        slopes_by: What these are the moments of: ``contrasts`` of the picture
-            (`hvs_suite.policies.belief.slope`), or what has the target's ``colour``
+        slopes: Cameras whose eyes tell slopes. With any, the head may let the tool lean about the
+            target.
+        slopes_by: What they tell them by: moments of the picture's ``contrasts``
+            (`hvs_suite.policies.belief.slope`), or the shape of what has the target's ``colour``
             (`hvs_suite.policies.belief.colour_slope`).
         offsets: Cameras whose pose is not exact, and of which the belief finds out how they are
             shifted and turned.

@@ -40,7 +40,7 @@ class HvsConfig(PreTrainedConfig):
         residual_reach_m: How far from the believed goal it does (m).
         reads_positions: Whether it reads measured joint positions, see `Shape`.
         reads_velocities: Whether it reads measured joint velocities.
-        slopes: Cameras whose eyes tell slopes by image moments, see `Shape`.
+        slopes: Cameras whose eyes tell slopes, see `Shape`.
         slopes_by: See `Shape`; ``hvs pretrain`` makes it ``colour``.
         offsets: Cameras whose pose is not exact, see `Shape`.
         family: Family of the tasks that it was trained for.

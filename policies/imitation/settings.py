@@ -53,7 +53,7 @@ class Settings:
         window_steps: Length of each.
         eye_share: Part of the training in which the eyes learn, the others from what they see in
             the rest. With 1 there is nothing but eyes, for another run to begin with.
-        slopes: Cameras whose eyes tell the slope of the surface by image moments.
+        slopes: Cameras whose eyes tell the slope of the surface.
         offsets: Cameras whose pose is not exact: how they are shifted and turned is found out.
     """
 
