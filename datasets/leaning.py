@@ -83,8 +83,8 @@ class Straightening:
     leans_rad: tuple[float, ...] = tuple(math.radians(lean) for lean in (33.0, 30.0, 20.0, 10.0))
     begin_m: float = 0.015
     above_m: float = 0.006
-    steady_rad: float = math.radians(36.0)
-    growth: float = 1.15
+    steady_rad: float = math.radians(41.0)
+    growth: float = 1.115
     upright_rad: float = math.radians(6.0)
 
     def next_place(self, goal: Goal, tip: Tip, q: FloatArray) -> tuple[Goal, bool]:
