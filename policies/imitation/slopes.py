@@ -33,6 +33,9 @@ FIRST_PASSES, FURTHER_PASSES = 25, 2
 """How often every frame is learned from: by a fresh judge, by one that goes on."""
 FIRST_RATE, FURTHER_RATE = 2e-3, 5e-4
 GRADIENT_NORM = 1.0
+LEAN_BIN_RAD = math.radians(2.0)
+LEAST_SHARE = 0.02
+"""Leans that are rarer among all frames are not drawn as if they were as frequent as the others."""
 LOOKED_AT_ONCE = 256
 
 Meter = Callable[[str, int], Callable[[int], None]]
@@ -100,9 +103,11 @@ def _learn(
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=n_steps)
     device = eye.n_lessons.device
     count = meter("learning slopes", n_steps * BATCH) if meter else None
+    weights = _leans_alike(facing[frames])
     eye.judge.train()
     for _ in range(n_steps):
-        drawn = frames[torch.randint(len(frames), (BATCH,), generator=generator)].sort().values
+        some = torch.multinomial(weights, BATCH, replacement=True, generator=generator)
+        drawn = frames[some].sort().values
         given = sighting[drawn].to(device)
         said, true = eye.lesson(
             shown(drawn),
@@ -121,3 +126,19 @@ def _learn(
             count(BATCH)
     eye.judge.eval()
     eye.n_lessons += 1
+
+
+def _leans_alike(facing: Tensor) -> Tensor:
+    """How often to draw frames so that no lean of the camera is more likely than others, (n,).
+
+    Demonstrations end upright. A judge that has learned this says of what leans a little that it
+    does not lean, in every picture again, and the belief takes its word.
+
+    Args:
+        facing: x and y of the true normals in the camera's optical frame, (n, 2).
+    """
+    lean = facing.norm(dim=1).clamp(max=1.0).asin()
+    which = (lean / LEAN_BIN_RAD).long()
+    counts = torch.bincount(which).clamp(min=math.ceil(LEAST_SHARE * len(lean)))
+    # On a disc of leans, a ring is as likely as it is long.
+    return (which + 0.5) / counts[which]

@@ -15,6 +15,7 @@ from hvs_suite.policies.belief.eye import LOG_DIAMETER, SIGHTING_SIZE, SLOPE, UV
 from hvs_suite.policies.belief.network import BeliefNetwork, Shape
 from hvs_suite.policies.catalogue import checkpoint_folder
 from hvs_suite.policies.checkpoints.loading import load_network
+from hvs_suite.policies.imitation import slopes
 from hvs_suite.policies.imitation.settings import take_eyes
 from hvs_suite.policies.imitation.slopes import (
     BATCH,
@@ -145,6 +146,36 @@ def test_a_judge_that_has_learned_goes_on_from_there(
         assert eye.n_lessons == lesson
     first = math.ceil(FIRST_PASSES * 8 / BATCH)
     assert len(passes) == first + math.ceil(FURTHER_PASSES * 8 / BATCH)
+
+
+def test_what_is_always_upright_in_the_end_is_not_taken_to_be_so(
+    network: BeliefNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lean = torch.cat([torch.full((300,), 0.01), torch.linspace(0.0, 0.6, 100)])
+    angle = torch.linspace(0.0, 60.0, 400)
+    facing = lean.sin()[:, None] * torch.stack([angle.cos(), angle.sin()], dim=1)
+    drawn: list[Tensor] = []
+    lesson = ColourSlopeEye.lesson
+
+    def noted(self: ColourSlopeEye, *given: object) -> tuple[Tensor, Tensor]:
+        drawn.append(given[3])
+        return lesson(self, *given)
+
+    monkeypatch.setattr(ColourSlopeEye, "lesson", noted)
+    monkeypatch.setattr(slopes, "FIRST_PASSES", 4)
+    images, size = seen(torch.zeros(1, 2), torch.zeros(1, 2))
+    uv = torch.zeros(500, 2)
+    learn(
+        network,
+        images.expand(500, -1, -1, -1),
+        looked(uv, size.expand(500, 1)),
+        torch.cat([facing, torch.zeros(100, 2)]),
+        torch.ones(500, dtype=torch.bool),
+    )
+    leans = torch.cat(drawn).norm(dim=1).asin()
+    # On a disc of leans up to 0.6, a ninth is below 0.2, and a quarter below 0.3.
+    assert (leans < 0.2).float().mean() == pytest.approx(1 / 9, abs=0.05)
+    assert (leans < 0.3).float().mean() == pytest.approx(1 / 4, abs=0.06)
 
 
 def test_nothing_is_learned_of_a_target_that_is_never_seen(network: BeliefNetwork) -> None:
