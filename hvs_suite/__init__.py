@@ -18,9 +18,11 @@ if platform.machine() in ("x86_64", "AMD64"):
     # every processor with AVX2. NumPy reads the variable when it loads. A value that the user has
     # set stays.
     os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
-# Two threads of torch wait for each other by spinning, for which they need the cores that other
-# programs would use, and get them late: beside another training, one took ten times as long.
-os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+if "OMP_WAIT_POLICY" not in os.environ:
+    # Two threads of torch wait for each other by spinning, on cores that other programs use. Beside
+    # another training, one that spins for less long is four times as fast; alone it is as fast
+    # (docs/experiments/busy-machine.md). GNU's OpenMP reads this when it loads.
+    os.environ.setdefault("GOMP_SPINCOUNT", "20000")
 
 from hvs_suite.gym import register
 from hvs_suite.registry import TASKS, load
