@@ -120,6 +120,10 @@ def test_held_out_frames_are_whole_episodes_that_training_never_sees(dataset, tm
 
 def test_of_few_demonstrations_only_those_are_seen(dataset, tmp_path):
     demonstrations = Demonstrations(read_manifest(dataset), tmp_path, seed=0, episodes=3)
+    # And no more are decoded.
+    assert len(np.load(tmp_path / "observation.images.eih.npy", mmap_mode="r")) == len(
+        demonstrations
+    )
     seen = np.concatenate([demonstrations.held_out, demonstrations.training])
     assert sorted(seen) == list(range(12))
 
