@@ -38,7 +38,7 @@ class Spiral:
 
     def above(self, goal: Goal, height_m: float) -> Goal:
         """So far above a goal (m), and facing it."""
-        return dataclasses.replace(goal, standoff_m=goal.standoff_m + height_m)
+        return raised(goal, height_m)
 
     def next_place(self, goal: Goal, tip: Tip, q: FloatArray) -> tuple[Goal, bool]:
         """Where to go next on the way down.
@@ -114,7 +114,7 @@ class Straightening:
             around = _leaning(goal, lean, _outward_rad(goal), height_m)
             if is_reachable(around):
                 return around
-        return dataclasses.replace(goal, standoff_m=goal.standoff_m + height_m)
+        return raised(goal, height_m)
 
 
 _BESIDE_M = 0.06
@@ -131,6 +131,11 @@ def way_down(spec: PanelSpec) -> Spiral | Straightening:
     """
     needed_rad = 1e-3 * spec.tightest_tolerance_mm / spec.standoff_m
     return Spiral() if needed_rad >= _QUICK_RAD else Straightening()
+
+
+def raised(goal: Goal, height_m: float) -> Goal:
+    """So far above a goal (m), along its normal."""
+    return dataclasses.replace(goal, standoff_m=goal.standoff_m + height_m)
 
 
 def _outward_rad(goal: Goal) -> float:

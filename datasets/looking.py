@@ -35,7 +35,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.datasets.expert import Expert
-from hvs_suite.datasets.leaning import way_down
+from hvs_suite.datasets.leaning import raised, way_down
 from hvs_suite.datasets.planner import Planner
 from hvs_suite.registry import TASKS
 from hvs_suite.tasks.shared.family import GOAL_UNSEEN
@@ -142,7 +142,7 @@ class Demonstrator(Expert):
         spec, height = self._env.spec, LOOK_DOWN_M[self._n_compared]
         if isinstance(spec, PanelSpec):
             return way_down(spec).above(goal, height)
-        return dataclasses.replace(goal, standoff_m=goal.standoff_m + height)
+        return raised(goal, height)
 
     def _unseen(self) -> FloatArray:
         """How far the goal is from where the pictures show it, (3,) m."""

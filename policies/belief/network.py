@@ -50,6 +50,8 @@ HEIGHTS_M = (0.0, 0.05, 0.15)
 """Above the goal, along its normal: the plain postures that the head is shown."""
 MOST_LEAN = 1.0
 """Tangent of the angle by which the head may let the tool lean to a side."""
+MOST_KEPT = 2.0
+"""By what factor it may at most have the tool go on leaning as it does."""
 ARRIVES_LEANING = math.tan(math.radians(33.0))
 LEANING_HEIGHTS_M = (0.006, 0.15)
 """Where slopes are to be seen, the head is also shown plain postures that lean away from the base,
@@ -461,7 +463,7 @@ class BeliefNetwork(nn.Module):
             if self._sees_slopes:
                 tool = -here.rotation[:, :, 2]
                 across = tool - (tool * facing).sum(dim=1, keepdim=True) * facing
-                facing = F.normalize(facing + 2.0 * torch.tanh(guided[:, 8:]) * across, dim=1)
+                facing = F.normalize(facing + MOST_KEPT * torch.tanh(guided[:, 8:]) * across, dim=1)
             # About the target, so that it stays in view.
             reach = self.belief.standoff.float() + by[:, 2:]
             waypoint = waypoint + reach * (facing - normal.detach())

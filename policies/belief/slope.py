@@ -43,37 +43,28 @@ LEAST_DIAMETER = 0.005
 """Smaller targets count as this large (image widths)."""
 LEAST_SPREAD = 0.003
 """What varies less is not raised to the others' scale."""
-PASSES = 30
-"""Passes of a judge over all frames."""
-RECENT = 100
-"""Batches over which means and spreads are averaged, about."""
 
 
-def new_judge(n_numbers: int, hidden: int = HIDDEN) -> nn.Sequential:
-    """A fresh network from numbers to a slope and its doubt.
-
-    Args:
-        n_numbers: That it is given.
-        hidden: Width of the first layer; the second has half of it.
-    """
-    last = nn.Linear(hidden // 2, SLOPE_SIZE)
-    nn.init.zeros_(last.weight)
-    with torch.no_grad():
-        last.bias.copy_(torch.tensor([0.0, 0.0, -1.0]))
+def _judge(n_numbers: int) -> nn.Sequential:
+    """A network from so many numbers to a slope and its doubt."""
+    half = HIDDEN // 2
     return nn.Sequential(
-        nn.Linear(n_numbers, hidden), nn.SiLU(), nn.Linear(hidden, hidden // 2), nn.SiLU(), last
+        nn.Linear(n_numbers, HIDDEN),
+        nn.SiLU(),
+        nn.Linear(HIDDEN, half),
+        nn.SiLU(),
+        nn.Linear(half, SLOPE_SIZE),
     )
 
 
 class SlopeEye(nn.Module):
-    """Says how a surface faces the camera.
+    """Says how a surface faces the camera, by weights that ship: it does not learn any more.
 
     Args:
         in_channels: Channels of the image.
         side: Side of the image (px).
     """
 
-    passes = PASSES
     contrasts: Tensor
     mean: Tensor
     variance: Tensor
@@ -86,13 +77,9 @@ class SlopeEye(nn.Module):
         n = len(contrasts) * len(WINDOWS) * (1 + len(PARTS))
         self.register_buffer("mean", torch.zeros(n))
         self.register_buffer("variance", torch.ones(n))
-        self.register_buffer("n_batches", torch.tensor(0.0))
-        self.judge = self.new_judge()
+        self.register_buffer("n_batches", torch.tensor(0.0))  # The shipped weights have it.
+        self.judge = _judge(n + 3)
         self._side, self._window = side, min(side, MOST_PX)
-
-    def new_judge(self) -> nn.Sequential:
-        """A fresh network from numbers to a slope and its doubt."""
-        return new_judge(len(self.mean) + 3)
 
     def forward(self, images: Tensor, uv: Tensor, log_diameter: Tensor) -> Tensor:
         """Look.
