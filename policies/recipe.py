@@ -1,9 +1,9 @@
 """How the shipped weights were made: the commands of each named task, to repeat it.
 
 ``recipes/<task>.json`` holds the training command of a policy, where it begins with the eyes of an
-earlier training on the same data the command of that one, and where the suite ships a fine-tuned
-policy the command that makes it; the dataset's recipe in ``datasets/recipes`` has the recording
-command. Tasks that differ in tolerance alone share a policy.
+earlier training the commands of that one, and where the suite ships a fine-tuned policy the command
+that makes it; the dataset's recipe in ``datasets/recipes`` has the recording command. Tasks that
+differ in tolerance alone share a policy.
 """
 
 import dataclasses
@@ -37,15 +37,15 @@ class Recipe:
     Attributes:
         task: Named task whose policy this is.
         record: Words after ``hvs`` that record the demonstrations.
-        eyes: Words after ``hvs`` that train whose eyes ``pretrain`` begins with; None if it begins
-            with fresh ones or with the eyes that the suite ships for another task.
+        eyes: Words after ``hvs`` of each command that makes the eyes ``pretrain`` begins with; none
+            if it begins with fresh ones or with eyes that the suite ships for other tasks.
         pretrain: Words after ``hvs`` that train on them.
         finetune: Words after ``hvs`` that fine-tune what came of it; None if that is not shipped.
     """
 
     task: str
     record: tuple[str, ...]
-    eyes: tuple[str, ...] | None
+    eyes: tuple[tuple[str, ...], ...]
     pretrain: tuple[str, ...]
     finetune: tuple[str, ...] | None
 
@@ -80,11 +80,11 @@ def recipe(task: str) -> Recipe:
         json.loads((folder / f"{name}.json").read_text())
         for folder in (DATASET_RECIPES, HERE / "recipes")
     )
-    eyes, finetune = (learned.get(key) for key in ("eyes", "finetune"))
+    finetune = learned.get("finetune")
     return Recipe(
         name,
         record=_words(recorded["command"]),
-        eyes=_words(eyes) if eyes else None,
+        eyes=tuple(_words(command) for command in learned.get("eyes", ())),
         pretrain=_words(learned["command"]),
         finetune=_words(finetune) if finetune else None,
     )

@@ -105,7 +105,7 @@ class Imitation:
             self.data_folder(out),
             policy,
             steps=self.steps,
-            eyes=None if self.eyes is None else checkpoint_folder("pretrained", self.eyes),
+            eyes=[] if self.eyes is None else [checkpoint_folder("pretrained", self.eyes)],
             workers=1,
             seed=seed,
             on_progress=note,

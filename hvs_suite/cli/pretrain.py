@@ -41,8 +41,9 @@ class Pretrain(Players):
             default.
         error_scale: Errors of a joint's step (rad) and of a place (m) weigh linearly below this
             and logarithmically above; five times the task's tightest tolerance by default.
-        eyes: Policy whose eyes to start from, where the target is too small for untrained eyes to
-            find: a checkpoint folder, or a named task for the weights shipped for it.
+        eyes: Policies whose eyes to start from, where the target is too small for untrained eyes to
+            find: checkpoint folders, or named tasks for the weights shipped for them. Each camera
+            starts with those of the first that has it.
         windows: Windows of control steps that belief and head learn from in a step.
         window_steps: Length of each.
         eye_share: Part of the training in which the eyes learn; in the rest belief and head do,
@@ -68,7 +69,7 @@ class Pretrain(Players):
     grey: str | None = None
     episodes: int | None = None
     error_scale: float | None = None
-    eyes: str | None = None
+    eyes: tuple[str, ...] = ()
     windows: int = 48
     window_steps: int = 16
     eye_share: float = 0.5
@@ -99,7 +100,7 @@ class Pretrain(Players):
                 grey=() if self.grey is None else tuple(self.grey.split("+")),
                 episodes=self.episodes,
                 error_scale=self.error_scale,
-                eyes=None if self.eyes is None else _folder(self.eyes),
+                eyes=[_folder(name) for name in self.eyes],
                 windows=self.windows,
                 window_steps=self.window_steps,
                 eye_share=self.eye_share,

@@ -35,13 +35,9 @@ class Reproduce:
         if self.episodes is not None and self.episodes < 1:
             raise OptionError(f"--episodes must be at least 1, not {self.episodes}")
         plan = recipe(self.task)
-        record = list(plan.record)
-        if (_out(record) / "hvs.json").exists():
-            record.append("--resume")
         episodes = self.episodes or EPISODES.get(self.task, TEST_SCENARIOS)
-        stages = {"record": record}
-        if plan.eyes is not None:
-            stages["eyes"] = list(plan.eyes)
+        stages = {"record": _going_on(plan.record)}
+        stages |= {f"eyes, {words[0]}": _going_on(words) for words in plan.eyes}
         results: dict[str, Path] = {}
         for name, train in (("pretrained", plan.pretrain), ("fine-tuned", plan.finetune)):
             if train is None:
@@ -65,6 +61,12 @@ class Reproduce:
                 f"{summary['pc_success']:.1f} % (95 % interval {low:.1f} to {high:.1f} %), "
                 f"{summary['n_collision']} collisions"
             )
+
+
+def _going_on(words: Sequence[str]) -> list[str]:
+    """A command; a recording that was begun has to be told to go on, a training does by itself."""
+    begun = words[0] == "record" and (_out(words) / "hvs.json").exists()
+    return [*words, "--resume"] if begun else [*words]
 
 
 def _out(words: Sequence[str]) -> Path:

@@ -26,7 +26,7 @@ REACH = 1.5
 CHANNELS = 3
 """Of the turned picture: how far each pixel's colour is on the way from the surroundings' to the
 target's, how far beside this way, and whether the camera saw it."""
-WIDTH = 32
+WIDTH = 48
 GROUPS = 4
 SQUEEZED = 24
 HIDDEN = 128

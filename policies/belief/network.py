@@ -50,6 +50,12 @@ HEIGHTS_M = (0.0, 0.05, 0.15)
 """Above the goal, along its normal: the plain postures that the head is shown."""
 MOST_LEAN = 1.0
 """Tangent of the angle by which the head may let the tool lean to a side."""
+LEAN_SCALE = 0.01
+"""Tangents below this are said linearly, those above logarithmically, where slopes are to be seen:
+from the side a degree does not matter, and at the goal a third of one does."""
+SURE = 3.0
+"""By which the weights of the proposals are multiplied where some of them lean: a tenth of the way
+to one of these would end a millimetre beside the goal."""
 MOST_KEPT = 2.0
 """By what factor it may at most have the tool go on leaning as it does."""
 ARRIVES_LEANING = math.tan(math.radians(33.0))
@@ -459,7 +465,12 @@ class BeliefNetwork(nn.Module):
         waypoint = waypoint + gain[:, 1:] * (ahead - sent.position)
         facing = normal.detach()
         if self.shape.slopes:
-            facing = _leaning(facing, MOST_LEAN * torch.tanh(guided[:, 6:8]))
+            if self._sees_slopes:
+                most = math.asinh(MOST_LEAN / LEAN_SCALE)
+                lean = LEAN_SCALE * torch.sinh(guided[:, 6:8].clamp(-most, most))
+            else:
+                lean = MOST_LEAN * torch.tanh(guided[:, 6:8])
+            facing = _leaning(facing, lean)
             if self._sees_slopes:
                 tool = -here.rotation[:, :, 2]
                 across = tool - (tool * facing).sum(dim=1, keepdim=True) * facing
@@ -492,6 +503,8 @@ class BeliefNetwork(nn.Module):
                 out.split([N_JOINTS, 1, len(proposals)], dim=1), OUT_BOUNDS, strict=True
             )
         )
+        if self._sees_slopes:
+            weights = SURE * weights
         # Weights and gate can become nearly whole: near the goal one proposal is right as it is.
         mean = (weights.softmax(dim=1)[:, :, None] * torch.stack(proposals, dim=1)).sum(dim=1)
         total = torch.asinh(mean / scale) + torch.sigmoid(is_corrected) * correction

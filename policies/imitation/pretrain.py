@@ -9,7 +9,7 @@ import dataclasses
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -109,7 +109,7 @@ def pretrain(
     *,
     minutes: float | None = None,
     steps: int | None = None,
-    eyes: Path | None = None,
+    eyes: Sequence[Path] = (),
     workers: Workers = 2,
     device: str = "cpu",
     checkpoint_period_s: float = 60.0,
@@ -124,7 +124,7 @@ def pretrain(
             lives in ``out/training``.
         minutes: Stop after this much training, decoding and DAgger rounds not counted (min).
         steps: Stop after this many optimiser steps. Give either, or both for the first reached.
-        eyes: Checkpoint of a policy to take the eyes of, see `take_eyes`; None for fresh ones.
+        eyes: Checkpoints of policies to take the eyes of, see `take_eyes`; none for fresh ones.
         workers: Processes that play the rounds, or others elsewhere; all give the same.
         device: Where the eyes learn, as torch calls it. Belief and head, whose steps are many and
             small, learn on the processor in any case.
@@ -156,8 +156,7 @@ def pretrain(
     with claimed(out, identity):
         training = out / "training"
         policy = new_policy(manifest, chosen)
-        if eyes is not None:
-            take_eyes(policy, eyes)
+        take_eyes(policy, eyes)
         policy.network.eyes.to(device)
         write_train_config(
             out,

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,7 +48,7 @@ class Settings:
         grey: Cameras whose pictures it is given in grey; the dataset's are in colour.
         episodes: Learn from the first so many demonstrations alone; None from all.
         error_scale: See `HvsConfig`.
-        eyes: SHA-256 of the weights whose eyes it begins with; None for fresh ones.
+        eyes: SHA-256 of the weights whose eyes it begins with; none for fresh ones.
         windows: Windows of control steps a step that belief and head learn from.
         window_steps: Length of each.
         eye_share: Part of the training in which the eyes learn, the others from what they see in
@@ -69,7 +69,7 @@ class Settings:
     grey: tuple[str, ...] = ()
     episodes: int | None = None
     error_scale: float
-    eyes: str | None = None
+    eyes: tuple[str, ...] = ()
     windows: int = 48
     window_steps: int = 16
     eye_share: float = 0.5
@@ -127,12 +127,12 @@ class Settings:
             raise OptionError(f"error_scale must be above 0, not {self.error_scale}")
 
 
-def settings_for(manifest: Manifest, eyes: Path | None, chosen: Mapping[str, Any]) -> Settings:
+def settings_for(manifest: Manifest, eyes: Sequence[Path], chosen: Mapping[str, Any]) -> Settings:
     """The settings of a run on a dataset.
 
     Args:
         manifest: Of the dataset.
-        eyes: Checkpoint of a policy to take the eyes of; None for fresh ones.
+        eyes: Checkpoints of policies to take the eyes of; none for fresh ones.
         chosen: Fields that differ from the defaults; ``error_scale`` is five times the task's
             tightest tolerance (m) where it is None.
 
@@ -147,7 +147,7 @@ def settings_for(manifest: Manifest, eyes: Path | None, chosen: Mapping[str, Any
         **chosen,
         dataset=fingerprint(manifest.root),
         task=manifest.task,
-        eyes=None if eyes is None else weights_digest(eyes),
+        eyes=tuple(weights_digest(folder) for folder in eyes),
     )
     settings.check(manifest)
     return settings
@@ -215,28 +215,32 @@ def _inputs(manifest: Manifest) -> dict[str, Any]:
     return inputs
 
 
-def take_eyes(policy: "HvsPolicy", folder: Path) -> None:
-    """Begin with the eyes of another policy, for each camera whose layers are alike.
+def take_eyes(policy: "HvsPolicy", folders: Sequence[Path]) -> None:
+    """Begin with the eyes of other policies: each camera with those of the first that has it.
 
     Eyes that found larger targets find smaller ones soon; fresh ones may never get to see a target
     of three pixels (docs/experiments/small-targets.md).
 
     Args:
         policy: Whose eyes to replace.
-        folder: Checkpoint of an `hvs` policy.
+        folders: Checkpoints of `hvs` policies.
 
     Raises:
-        PolicyError: It is none, or no camera has the same layers in both.
+        PolicyError: One is none, or has no layers that a camera could begin with.
     """
-    others, eyes = load_network(folder).eyes, policy.network.eyes
-    alike = [name for name in eyes if name in others and _fits(eyes[name], others[name])]
-    if not alike:
-        raise PolicyError(
-            f"{folder} has no eyes that fit {', '.join(eyes)}: their layers depend on the images' "
-            "sides and channels"
-        )
-    for name in alike:
-        eyes[name].load_state_dict(_layers(others[name], eyes[name]), strict=False)
+    eyes = policy.network.eyes
+    fresh = {*eyes}
+    for folder in folders:
+        others = load_network(folder).eyes
+        alike = {name for name in fresh if name in others and _fits(eyes[name], others[name])}
+        if not alike:
+            raise PolicyError(
+                f"{folder} has no eyes that fit {', '.join(sorted(fresh)) or 'what is left'}: "
+                "their layers depend on the images' sides and channels"
+            )
+        for name in alike:
+            eyes[name].load_state_dict(_layers(others[name], eyes[name]), strict=False)
+        fresh -= alike
 
 
 def _fits(eye: nn.Module, other: nn.Module) -> bool:

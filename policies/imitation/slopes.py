@@ -28,8 +28,8 @@ from hvs_suite.policies.belief.network import BeliefNetwork
 
 FACING = slice(SLOPE.start, LOG_SIGMA_SLOPE.stop)
 """The part of a sighting that is learned here."""
-BATCH = 64
-FIRST_PASSES, FURTHER_PASSES = 25, 2
+BATCH = 256
+FIRST_PASSES, FURTHER_PASSES = 20, 2
 """How often every frame is learned from: by a fresh judge, by one that goes on."""
 FIRST_RATE, FURTHER_RATE = 2e-3, 5e-4
 GRADIENT_NORM = 1.0

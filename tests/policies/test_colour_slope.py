@@ -112,7 +112,11 @@ def looked(uv: Tensor, size: Tensor) -> Tensor:
     return sightings
 
 
-def test_slopes_are_learned_from_all_frames_that_show_the_target(network: BeliefNetwork) -> None:
+def test_slopes_are_learned_from_all_frames_that_show_the_target(
+    network: BeliefNetwork, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A few hundred frames are a step or two of what learns from tens of thousands.
+    monkeypatch.setattr(slopes, "BATCH", 32)
     n = 500
     facing, uv = (size * torch.randn(n, 2).clamp(-2.0, 2.0) for size in (0.3, 0.3))
     images, size = seen(facing, uv)
@@ -261,7 +265,7 @@ def test_eyes_begin_with_those_that_told_slopes_otherwise() -> None:
     torch.manual_seed(0)
     network = BeliefNetwork(dataclasses.replace(other.shape, slopes_by="colour"), other.cell)
     told = network.eyes["eih"].slope.judge.features[0].weight.clone()
-    take_eyes(SimpleNamespace(network=network), folder)
+    take_eyes(SimpleNamespace(network=network), [folder])
     torch.testing.assert_close(
         network.eyes["eih"].features[0].weight, other.eyes["eih"].features[0].weight
     )

@@ -240,7 +240,7 @@ def test_errors_weigh_by_the_tolerance_unless_told_otherwise(dataset, tmp_path):
 def test_eyes_of_another_policy_are_where_training_begins(dataset, large_dataset, tmp_path):
     learned, out = tmp_path / "learned", tmp_path / "run"
     pretrain(dataset, learned, steps=2, batch_size=4)
-    pretrain(dataset, out, steps=1, batch_size=4, learning_rate=1e-9, seed=1, eyes=learned)
+    pretrain(dataset, out, steps=1, batch_size=4, learning_rate=1e-9, seed=1, eyes=[learned])
     after = weights(out)
     for name, before in weights(learned).items():
         change = (after[name] - before).abs().max().item()
@@ -248,9 +248,9 @@ def test_eyes_of_another_policy_are_where_training_begins(dataset, large_dataset
         assert change > 1e-6 or ".head." not in name or "bias" in name
     assert json.loads((out / "train_config.json").read_text())["settings"]["eyes"]
     with pytest.raises(PolicyError, match="not a LeRobot checkpoint"):
-        pretrain(dataset, tmp_path / "other", steps=1, eyes=tmp_path)
+        pretrain(dataset, tmp_path / "other", steps=1, eyes=[tmp_path])
     with pytest.raises(PolicyError, match="no eyes that fit"):
-        pretrain(large_dataset, tmp_path / "large", steps=1, batch_size=4, eyes=learned)
+        pretrain(large_dataset, tmp_path / "large", steps=1, batch_size=4, eyes=[learned])
 
 
 def test_data_recorded_on_the_test_split_is_refused(tmp_path):

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 import torch
 import torch.nn.functional as F  # noqa: N812
 
@@ -14,8 +15,9 @@ from hvs_suite.policies.belief.belief import PLACE, TILT
 from hvs_suite.policies.belief.cell_model import cell_model
 from hvs_suite.policies.belief.eye import SIGHTING_SIZE
 from hvs_suite.policies.belief.geometry import flange_motion
-from hvs_suite.policies.belief.network import BeliefNetwork, Shape
+from hvs_suite.policies.belief.network import LEAN_SCALE, MOST_LEAN, BeliefNetwork, Shape
 
+LEAN = math.radians(20.0)
 UNSEEN = 5  # of the dev split: the arm, upright, hides the target from the eye to hand
 
 
@@ -79,16 +81,23 @@ def test_no_zero_has_a_sign_because_logs_are_twice_as_long_with_it() -> None:
     assert not torch.signbit(action[action == 0.0]).any()
 
 
-def test_a_head_that_sees_slopes_can_lean_around_the_target() -> None:
+@pytest.mark.parametrize(
+    ("slopes_by", "said"),
+    [
+        ("contrasts", math.atanh(math.tan(LEAN) / MOST_LEAN)),
+        ("colour", math.asinh(math.tan(LEAN) / LEAN_SCALE)),
+    ],
+)
+def test_a_head_that_sees_slopes_can_lean_around_the_target(slopes_by: str, said: float) -> None:
     torch.manual_seed(0)
     spec = hvs_suite.load("surface-tilted", observations="state").spec
-    shape = Shape({"eih": (3, 64)}, hidden=8, slopes=("eih",))
+    shape = Shape({"eih": (3, 64)}, hidden=8, slopes=("eih",), slopes_by=slopes_by)
     network = BeliefNetwork(shape, cell_model(spec))
-    target, standoff_m, lean = torch.tensor([[0.5, 0.2, 0.1]]), 0.05, math.radians(20.0)
+    target, standoff_m = torch.tensor([[0.5, 0.2, 0.1]]), 0.05
     with torch.no_grad():
         network.belief.prior[:3] = target[0]
         network.belief.standoff.fill_(standoff_m)
-        network.guide[-1].bias[6:] = torch.atanh(torch.tensor([0.0, math.tan(lean)]))
+        network.guide[-1].bias[6:8] = torch.tensor([0.0, said])
     up = torch.tensor([[0.0, 0.0, 1.0]])
     q = F.pad(arm.postures(target + standoff_m * up, up)[:, 0], (0, 1))
     memory = network.start(1)
@@ -98,7 +107,7 @@ def test_a_head_that_sees_slopes_can_lean_around_the_target() -> None:
         decision = network.decide(memory, sightings, F.pad(q, (0, 7)))
         q = q + network.to_step(decision.proposals[:, 0]).detach()
     motion = flange_motion(q)
-    facing = torch.tensor([[0.0, math.sin(lean), math.cos(lean)]])
+    facing = torch.tensor([[0.0, math.sin(LEAN), math.cos(LEAN)]])
     torch.testing.assert_close(-motion.rotation[:, :, 2], facing, atol=2e-3, rtol=0.0)
     torch.testing.assert_close(motion.position, target + standoff_m * facing, atol=5e-4, rtol=0.0)
     # And it can be taught to.
