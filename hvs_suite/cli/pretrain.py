@@ -44,6 +44,7 @@ class Pretrain(Players):
         eyes: Policies whose eyes to start from, where the target is too small for untrained eyes to
             find: checkpoint folders, or named tasks for the weights shipped for them. Each camera
             starts with those of the first that has it.
+        kept_eyes: Cameras whose eyes stay as they were taken, joined by +.
         windows: Windows of control steps that belief and head learn from in a step.
         window_steps: Length of each.
         eye_share: Part of the training in which the eyes learn; in the rest belief and head do,
@@ -70,6 +71,7 @@ class Pretrain(Players):
     episodes: int | None = None
     error_scale: float | None = None
     eyes: tuple[str, ...] = ()
+    kept_eyes: str | None = None
     windows: int = 48
     window_steps: int = 16
     eye_share: float = 0.5
@@ -101,6 +103,7 @@ class Pretrain(Players):
                 episodes=self.episodes,
                 error_scale=self.error_scale,
                 eyes=[_folder(name) for name in self.eyes],
+                kept_eyes=() if self.kept_eyes is None else tuple(self.kept_eyes.split("+")),
                 windows=self.windows,
                 window_steps=self.window_steps,
                 eye_share=self.eye_share,

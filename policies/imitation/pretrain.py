@@ -156,7 +156,7 @@ def pretrain(
     with claimed(out, identity):
         training = out / "training"
         policy = new_policy(manifest, chosen)
-        take_eyes(policy, eyes)
+        take_eyes(policy, eyes, chosen.kept_eyes)
         policy.network.eyes.to(device)
         write_train_config(
             out,

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,6 +49,7 @@ class Settings:
         episodes: Learn from the first so many demonstrations alone; None from all.
         error_scale: See `HvsConfig`.
         eyes: SHA-256 of the weights whose eyes it begins with; none for fresh ones.
+        kept_eyes: Cameras whose eyes stay as they were taken.
         windows: Windows of control steps a step that belief and head learn from.
         window_steps: Length of each.
         eye_share: Part of the training in which the eyes learn, the others from what they see in
@@ -70,6 +71,7 @@ class Settings:
     episodes: int | None = None
     error_scale: float
     eyes: tuple[str, ...] = ()
+    kept_eyes: tuple[str, ...] = ()
     windows: int = 48
     window_steps: int = 16
     eye_share: float = 0.5
@@ -92,8 +94,10 @@ class Settings:
         if unknown := sorted({*(self.inputs or ())} - {*INPUTS}):
             raise OptionError(f"unknown input {unknown[0]!r}; choose from {', '.join(INPUTS)}")
         cameras = [name for name in manifest.cameras if self.reads(name)]
-        if unknown := sorted({*self.slopes, *self.offsets} - {*cameras}):
+        if unknown := sorted({*self.slopes, *self.offsets, *self.kept_eyes} - {*cameras}):
             raise OptionError(f"unknown camera {unknown[0]!r}; choose from {', '.join(cameras)}")
+        if {*self.kept_eyes} == {*cameras}:
+            raise OptionError("kept_eyes must leave a camera whose eye learns")
         for name in ("batch_size", "dagger_frames", "windows", "window_steps"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}")
@@ -215,7 +219,7 @@ def _inputs(manifest: Manifest) -> dict[str, Any]:
     return inputs
 
 
-def take_eyes(policy: "HvsPolicy", folders: Sequence[Path]) -> None:
+def take_eyes(policy: "HvsPolicy", folders: Sequence[Path], kept: Collection[str] = ()) -> None:
     """Begin with the eyes of other policies: each camera with those of the first that has it.
 
     Eyes that found larger targets find smaller ones soon; fresh ones may never get to see a target
@@ -224,9 +228,11 @@ def take_eyes(policy: "HvsPolicy", folders: Sequence[Path]) -> None:
     Args:
         policy: Whose eyes to replace.
         folders: Checkpoints of `hvs` policies.
+        kept: Cameras whose eyes are to learn no more.
 
     Raises:
-        PolicyError: One is none, or has no layers that a camera could begin with.
+        PolicyError: One is none, or has no layers that a camera could begin with; or none has all
+            that a camera needs which is to learn no more.
     """
     eyes = policy.network.eyes
     fresh = {*eyes}
@@ -239,8 +245,14 @@ def take_eyes(policy: "HvsPolicy", folders: Sequence[Path]) -> None:
                 "their layers depend on the images' sides and channels"
             )
         for name in alike:
-            eyes[name].load_state_dict(_layers(others[name], eyes[name]), strict=False)
+            given = eyes[name].load_state_dict(_layers(others[name], eyes[name]), strict=False)
+            if name in kept and given.missing_keys:
+                raise PolicyError(f"the eye {name} of {folder} does not tell all it would have to")
         fresh -= alike
+    if missing := sorted(fresh & {*kept}):
+        raise PolicyError(f"no eyes were given for {missing[0]}, which is to keep them")
+    for name in kept:
+        eyes[name].requires_grad_(False)
 
 
 def _fits(eye: nn.Module, other: nn.Module) -> bool:

@@ -54,6 +54,8 @@ def learn_slopes(
 ) -> None:
     """Teach each eye that tells slopes from all frames.
 
+    Those that are kept as they are say what they say.
+
     Args:
         network: Gets what is learned; in evaluation mode.
         pictures: Gives a camera's images of frames in ascending order, (B, C, H, W) uint8.
@@ -66,6 +68,8 @@ def learn_slopes(
     """
     for name, eye in network.eyes.items():
         if not isinstance(eye, Eye) or not isinstance(eye.slope, ColourSlopeEye):
+            continue
+        if not all(weight.requires_grad for weight in eye.slope.judge.parameters()):
             continue
         sighting = sightings[name]
         seen = visible[name] & (sighting[:, VISIBLE.start] > 0.0)

@@ -253,6 +253,27 @@ def test_eyes_of_another_policy_are_where_training_begins(dataset, large_dataset
         pretrain(large_dataset, tmp_path / "large", steps=1, batch_size=4, eyes=[learned])
 
 
+def test_an_eye_that_is_kept_learns_no_more_and_the_others_do(dataset, tmp_path):
+    learned, out = tmp_path / "learned", tmp_path / "run"
+    pretrain(dataset, learned, steps=2, batch_size=4)
+    pretrain(dataset, out, steps=3, batch_size=4, seed=1, eyes=[learned], kept_eyes=("eih",))
+    after = weights(out)
+    for name, before in weights(learned).items():
+        if ".eyes.eih." in name:
+            assert torch.equal(after[name], before)
+    assert any(
+        not torch.equal(after[name], before)
+        for name, before in weights(learned).items()
+        if ".eyes.eth." in name
+    )
+    with pytest.raises(PolicyError, match="no eyes were given for eih"):
+        pretrain(dataset, tmp_path / "none", steps=1, kept_eyes=("eih",))
+    with pytest.raises(OptionError, match="must leave a camera"):
+        pretrain(dataset, tmp_path / "all", steps=1, eyes=[learned], kept_eyes=("eih", "eth"))
+    with pytest.raises(OptionError, match="unknown camera 'eye'"):
+        pretrain(dataset, tmp_path / "eye", steps=1, eyes=[learned], kept_eyes=("eye",))
+
+
 def test_data_recorded_on_the_test_split_is_refused(tmp_path):
     root = tmp_path / "data"
     miniature.write_dataset(root, miniature.scene(4), miniature.episodes(4), split="test")
