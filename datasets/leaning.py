@@ -2,8 +2,9 @@
 
 Pictures from one place are all wrong about a slope in the same way, so their mean is no better than
 one of them. Where slope and place have to be seen better than that, the demonstrator looks from
-many places on its way down. Where it goes next depends on where it is and on what can be known
-there, and on nothing else, so a learner needs no memory of where it has looked from.
+many places on its way down. Where it goes next depends on where it is, on the time that is left and
+on what can be known there, and on nothing else, so a learner needs no memory of where it has looked
+from.
 """
 
 import dataclasses
@@ -40,13 +41,14 @@ class Spiral:
         """So far above a goal (m), and facing it."""
         return raised(goal, height_m)
 
-    def next_place(self, goal: Goal, tip: Tip, q: FloatArray) -> tuple[Goal, bool]:
+    def next_place(self, goal: Goal, tip: Tip, q: FloatArray, steps_left: int) -> tuple[Goal, bool]:
         """Where to go next on the way down.
 
         Args:
             goal: Where it ends.
             tip: Where the tool is.
             q: Joint angles, (7,) rad.
+            steps_left: Until it has to be at the goal.
 
         Returns:
             A place around the target, or `goal` itself where it is near and where the arm reaches
@@ -66,28 +68,34 @@ class Spiral:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Straightening:
-    """Arrives leaning far, near by, and straightens up step by step.
+    """Looks from the side, near by, for as long as there is time, and then straightens up.
 
-    From the side a look says most of a slope, and the nearer the more. How far the tool leans says
-    how much of the way is left: the more upright, the less.
+    From the side a look says most of a slope, and the nearer the more. Two looks from one place say
+    no more than one, because they err alike. So the last joint turns meanwhile, and with it the
+    picture. The time alone says how far to lean and to turn: what imitates this and is late is told
+    to hurry.
 
     Attributes:
-        leans_rad: How far it leans when it arrives: as far as the arm reaches, of these.
-        begin_m: How far above the goal it begins to straighten up.
-        above_m: How far above the goal it does so.
-        steady_rad: A lean that would stay as it is from step to step.
-        growth: By what factor a lean is farther from that one after a step.
-        upright_rad: Leaning less it goes straight to the goal, and stays so near to it.
+        leans_rad: How far it leans: as far as the arm reaches, of these.
+        begin_m: So near to the goal it has arrived.
+        above_m: How far above the goal it leans.
+        up_steps: For how many steps it straightens up.
+        upright_steps: When so many steps are left it is upright.
+        turn_rad: By how much the last joint turns in a step.
+        most_turn_rad: By how much it turns at most, on its way to where it should be by now.
+        middle_steps: When so many steps are left the last joint is in its middle.
     """
 
     leans_rad: tuple[float, ...] = tuple(math.radians(lean) for lean in (33.0, 30.0, 20.0, 10.0))
     begin_m: float = 0.015
     above_m: float = 0.006
-    steady_rad: float = math.radians(41.0)
-    growth: float = 1.115
-    upright_rad: float = math.radians(6.0)
+    up_steps: int = 10
+    upright_steps: int = 10
+    turn_rad: float = 0.1
+    most_turn_rad: float = 0.2
+    middle_steps: int = 25
 
-    def next_place(self, goal: Goal, tip: Tip, q: FloatArray) -> tuple[Goal, bool]:
+    def next_place(self, goal: Goal, tip: Tip, q: FloatArray, steps_left: int) -> tuple[Goal, bool]:
         """Where to go next on the way down; see `Spiral.next_place`.
 
         It leans away from the base, in the plane of a plain posture. A side that depended on where
@@ -95,18 +103,29 @@ class Straightening:
         leaning to the base the wrist is nearly straight, where a little of slope turns it by much.
         """
         left_m = _left_m(goal, tip)
-        if left_m > self.begin_m:
-            return self.above(goal, self.above_m), left_m < _BESIDE_M
-        lean = math.acos(float(np.clip(-tip.axis @ goal.normal, -1.0, 1.0)))
-        if lean > self.upright_rad:
-            most = self.steady_rad - self.growth * (self.steady_rad - lean)
-            above_m = self.above_m * min(lean / (2.0 * self.upright_rad), 1.0)
-            for share in (1.0, 0.8, 0.6):
-                farthest = share * min(most, self.leans_rad[0])
-                around = _leaning(goal, farthest, _outward_rad(goal), above_m)
-                if are_near(q, around, goal):
-                    return around, True
-        return goal, True
+        share = min(max((steps_left - self.upright_steps) / self.up_steps, 0.0), 1.0)
+        above_m = self.above_m * min(2.0 * share, 1.0)
+        if share > 0.0:
+            for lean in self.leans_rad:
+                around = _leaning(goal, share * lean, _outward_rad(goal), above_m)
+                has_come = left_m <= self.begin_m
+                if are_near(q, around, goal) if has_come else is_reachable(around):
+                    return around, left_m < _BESIDE_M
+        return goal, left_m < _BESIDE_M
+
+    def turned(self, angle_rad: float, steps_left: int) -> float:
+        """Where to send the last joint next.
+
+        Args:
+            angle_rad: Where it was sent to before.
+            steps_left: As in `next_place`.
+
+        Returns:
+            rad.
+        """
+        by_now = self.turn_rad * (self.middle_steps - steps_left)
+        most = self.most_turn_rad
+        return angle_rad + min(max(by_now - angle_rad, -most), most)
 
     def above(self, goal: Goal, height_m: float) -> Goal:
         """So far above a goal (m), leaning as far as the arm reaches."""

@@ -35,7 +35,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hvs_suite.datasets.expert import Expert
-from hvs_suite.datasets.leaning import raised, way_down
+from hvs_suite.datasets.leaning import Straightening, raised, way_down
 from hvs_suite.datasets.planner import Planner
 from hvs_suite.registry import TASKS
 from hvs_suite.tasks.shared.family import GOAL_UNSEEN
@@ -128,10 +128,15 @@ class Demonstrator(Expert):
                 q, velocity, set_point, goal, spec.caught_mm, gently=bool(self._unseen().any())
             )
         if isinstance(spec, PanelSpec) and self._has_seen_closely:
-            around, is_near = way_down(spec).next_place(goal, self._env.tip(), q)
+            way = way_down(spec)
+            steps_left = spec.time_limit_steps - spec.hold_steps - self._env.control_steps
+            around, is_near = way.next_place(goal, self._env.tip(), q, steps_left)
             planner = self._near_planner if is_near else self._planner
             planner.avoid(self._env.obstacles)
-            return planner.next_set_point(q, velocity, around)
+            ahead = planner.next_set_point(q, velocity, around)
+            if is_near and around is not goal and isinstance(way, Straightening):
+                ahead[-1] = way.turned(set_point[-1], steps_left)
+            return ahead
         return super()._next_set_point(q, velocity, set_point)
 
     def _goal_in(self, ahead_s: float) -> Goal:

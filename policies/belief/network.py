@@ -143,12 +143,14 @@ class Shape:
     offsets: tuple[str, ...] = ()
 
 
-MEMORY_SIZE = BELIEF_SIZE + 2 * N_JOINTS + 1 + RECENT_SIZE
+MEMORY_SIZE = BELIEF_SIZE + 2 * N_JOINTS + 2 + RECENT_SIZE
 SET_POINT = slice(BELIEF_SIZE, BELIEF_SIZE + N_JOINTS)
 TRAILING = slice(SET_POINT.stop, SET_POINT.stop + N_JOINTS)
 """Where the joints will be when they have been sent to the set point for a control step."""
 BEGUN = slice(TRAILING.stop, TRAILING.stop + 1)
-RECENT = slice(BEGUN.stop, MEMORY_SIZE)
+STEPS = slice(BEGUN.stop, BEGUN.stop + 1)
+"""How many observations there have been."""
+RECENT = slice(STEPS.stop, MEMORY_SIZE)
 FELT = slice(MEMORY_SIZE, MEMORY_SIZE + RESIDUAL_SIZE)
 """Where what the residual remembers stands, in networks that have one."""
 
@@ -217,14 +219,15 @@ class BeliefNetwork(nn.Module):
         width += N_MOTION + 1 + 3 + 3 + 2  # deviations; velocity, acceleration, slope
         width += 2 * 8  # arm and set point in the goal's frame
         width += shape.n_felt * 2
+        width += self._sees_slopes  # the time
         self.width = width
         n_ways = len(HEIGHTS_M) + self._sees_slopes * len(LEANING_HEIGHTS_M)
         way_width = n_ways * (2 * (N_JOINTS - 1) + 2)
         # To which point by the goal: sideways (two) and along the normal, how far ahead, and what
         # is added for where the tip is, and where it was sent.
-        # With slopes to see, also how far to lean to either side of the base frame, and how much of
-        # the lean to keep.
-        n_leans = 3 if self._sees_slopes else 2 if shape.slopes else 0
+        # With slopes to see, also how far to lean to either side of the base frame, how much of the
+        # lean to keep, and by how much to turn the last joint, which moves the picture alone.
+        n_leans = 4 if self._sees_slopes else 2 if shape.slopes else 0
         guide_last = nn.Linear(128, 6 + n_leans)
         nn.init.zeros_(guide_last.weight)
         nn.init.zeros_(guide_last.bias)
@@ -354,7 +357,13 @@ class BeliefNetwork(nn.Module):
         unseen = torch.maximum(recent[:, :2], forget) * (1.0 - seen)
         away = (1.0 - seen) * (recent[:, 2:] * 0.9 + 0.1)
         parts = [believed[:, :BELIEF_SIZE], set_point, trailing, torch.ones_like(set_point[:, :1])]
-        parts += [unseen, away, memory[:, MEMORY_SIZE:offsets], believed[:, BELIEF_SIZE:]]
+        parts += [
+            memory[:, STEPS] + 1.0,
+            unseen,
+            away,
+            memory[:, MEMORY_SIZE:offsets],
+            believed[:, BELIEF_SIZE:],
+        ]
         return torch.cat(parts, dim=1)
 
     def feel(
@@ -474,7 +483,9 @@ class BeliefNetwork(nn.Module):
             if self._sees_slopes:
                 tool = -here.rotation[:, :, 2]
                 across = tool - (tool * facing).sum(dim=1, keepdim=True) * facing
-                facing = F.normalize(facing + MOST_KEPT * torch.tanh(guided[:, 8:]) * across, dim=1)
+                facing = F.normalize(
+                    facing + MOST_KEPT * torch.tanh(guided[:, 8:9]) * across, dim=1
+                )
             # About the target, so that it stays in view.
             reach = self.belief.standoff.float() + by[:, 2:]
             waypoint = waypoint + reach * (facing - normal.detach())
@@ -489,6 +500,9 @@ class BeliefNetwork(nn.Module):
             proposals.append(F.pad(step, (0, 1)))
             ways += [torch.asinh(turns / scale), time_s, within]
             ways.append(torch.asinh(step / scale))
+        if self._sees_slopes:
+            turn = scale * torch.sinh(guided[:, 9:].clamp(-bound, bound))
+            proposals = [proposal + F.pad(turn, (N_JOINTS - 1, 0)) for proposal in proposals]
         if self.cell.look_out_rad is not None:
             turns = joints.new_tensor(self.cell.look_out_rad) - joints
             gone = arm.along_way(turns, velocity, ahead_s, together=False)
@@ -601,6 +615,9 @@ class BeliefNetwork(nn.Module):
             features.append(self._in_goal_frame(tip, place.goal, place.normal))
         if felt is not None:
             features += [felt / 20.0, torch.asinh(felt / 0.5)]
+        if self._sees_slopes:
+            # It looks from the side for as long as there is time.
+            features.append(self.cell.period_s * memory[:, STEPS].float())
         return torch.cat(features, dim=1)
 
     def _in_goal_frame(self, tip: FlangeMotion, goal: Tensor, normal: Tensor) -> Tensor:
