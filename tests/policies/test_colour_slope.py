@@ -116,7 +116,7 @@ def test_slopes_are_learned_from_all_frames_that_show_the_target(
     network: BeliefNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A few hundred frames are a step or two of what learns from tens of thousands.
-    monkeypatch.setattr(slopes, "BATCH", 32)
+    monkeypatch.setattr(slopes, "BATCH", 16)
     n = 500
     facing, uv = (size * torch.randn(n, 2).clamp(-2.0, 2.0) for size in (0.3, 0.3))
     images, size = seen(facing, uv)
