@@ -9,6 +9,7 @@ from.
 
 import dataclasses
 import math
+from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
@@ -105,13 +106,13 @@ class Straightening:
         left_m = _left_m(goal, tip)
         share = min(max((steps_left - self.upright_steps) / self.up_steps, 0.0), 1.0)
         above_m = self.above_m * min(2.0 * share, 1.0)
-        if share > 0.0:
-            for lean in self.leans_rad:
-                around = _leaning(goal, share * lean, _outward_rad(goal), above_m)
-                has_come = left_m <= self.begin_m
-                if are_near(q, around, goal) if has_come else is_reachable(around):
-                    return around, left_m < _BESIDE_M
-        return goal, left_m < _BESIDE_M
+        has_come = left_m <= self.begin_m
+
+        def is_on_the_way(place: Goal) -> bool:
+            return are_near(q, place, goal) if has_come else is_reachable(place)
+
+        places = self._leaning(goal, share, above_m) if share > 0.0 else ()
+        return next(filter(is_on_the_way, places), goal), left_m < _BESIDE_M
 
     def turned(self, angle_rad: float, steps_left: int) -> float:
         """Where to send the last joint next.
@@ -129,11 +130,14 @@ class Straightening:
 
     def above(self, goal: Goal, height_m: float) -> Goal:
         """So far above a goal (m), leaning as far as the arm reaches."""
+        return next(
+            filter(is_reachable, self._leaning(goal, 1.0, height_m)), raised(goal, height_m)
+        )
+
+    def _leaning(self, goal: Goal, share: float, above_m: float) -> Iterator[Goal]:
+        """Places so far above a goal (m), leaning away from the base by a share, farthest first."""
         for lean in self.leans_rad:
-            around = _leaning(goal, lean, _outward_rad(goal), height_m)
-            if is_reachable(around):
-                return around
-        return raised(goal, height_m)
+            yield _leaning(goal, share * lean, _outward_rad(goal), above_m)
 
 
 _BESIDE_M = 0.06
