@@ -9,7 +9,7 @@ from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork, Decision
 
 HUBER_BETA = 0.3
 TIP_WEIGHT = 0.3
-CHOICE_WEIGHT = 0.3
+CHOICE_WEIGHT = 0.1
 CHOICE_SCALE = 0.1
 """Mean error of a joint, as it is encoded, by which a proposal is e times less likely."""
 LEVER_M = 0.2
