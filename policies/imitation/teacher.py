@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from hvs_suite.datasets.features import STATE
 from hvs_suite.errors import DatasetError
-from hvs_suite.policies.belief.lessons import Step, eye_lesson, traced, window_lesson
+from hvs_suite.policies.belief.lessons import eye_lesson, window_lesson
 from hvs_suite.policies.belief.network import N_JOINTS
 from hvs_suite.policies.belief.prior import take_prior
 from hvs_suite.policies.belief.recorded import recorded, recorded_keys
@@ -69,7 +69,6 @@ class Teacher:
         """Part of the training in which the eyes looked at all frames last."""
         self._due = 0.0
         self._opened = False
-        self._step: Step | None = None
         self._share, self._at, self._eyes_learn = 0.0, 0, True
 
     def clipped_apart(self) -> list[list[nn.Parameter]]:
@@ -149,8 +148,7 @@ class Teacher:
                 self._settings.window_steps,
                 np.random.Generator(key),
             )
-            self._step = self._step or traced(self.policy.network, window)
-            loss, parts = window_lesson(self.policy.network, window, self._step)
+            loss, parts = window_lesson(self.policy.network, window)
         return loss, {name: part.item() for name, part in parts.items()}
 
     def _eye_lesson(self, rows: Rows) -> tuple[Tensor, dict[str, Tensor]]:

@@ -12,7 +12,6 @@ import torch
 from safetensors.torch import load_file
 
 from hvs_suite.errors import DatasetError, OptionError
-from hvs_suite.policies.belief.lessons import remembered, traced
 from hvs_suite.policies.belief.network import SET_POINT
 from hvs_suite.policies.checkpoints.loading import CheckpointFactory, load_network
 from hvs_suite.policies.imitation.demonstrations import Demonstrations
@@ -128,26 +127,3 @@ def test_a_dataset_that_does_not_say_what_is_true_is_refused(tmp_path):
     with pytest.raises(DatasetError, match="lacks privileged"):
         pretrain(tmp_path / "data", tmp_path / "out", steps=1, **SMALL)
     shutil.rmtree(tmp_path / "out")
-
-
-def test_a_compiled_step_gives_the_same_numbers_at_every_call_and_with_other_weights(
-    trained, tmp_path
-):
-    demonstrations = Demonstrations(read_manifest(SAMPLE), tmp_path / "cache", 0)
-    network = load_network(trained)
-    pool = WindowPool(demonstrations, None, None)
-    pool.look(network)
-    window = pool.draw(network, demonstrations.weights(), 6, 4, np.random.default_rng(0))
-    step = traced(network, window)
-    learned = [*network.belief.parameters()]
-    for _ in range(2):
-        whole = remembered(network, window)
-        compiled = [remembered(network, window, step) for _ in range(2)]
-        slopes = [torch.autograd.grad(memory.square().mean(), learned) for memory in compiled]
-        assert all(torch.equal(memory, whole) for memory in compiled)
-        # To the last digit: else a killed training would end otherwise than one left alone.
-        assert all(torch.equal(first, second) for first, second in zip(*slopes, strict=True))
-        assert any(slope.any() for slope in slopes[0])
-        with torch.no_grad():
-            for parameter in learned:
-                parameter.mul_(1.01)
