@@ -16,8 +16,8 @@ A target that is suddenly elsewhere counts as a new one that has not been seen. 
 both cameras have seen, more is known of how the eye-to-hand camera is shifted and turned: over the
 second target the demonstrator looks from lower, and to those that follow it goes straight.
 
-And where the arm may start anywhere, it goes there in one of two plain postures (see
-`hvs_suite.datasets.planner.Planner`).
+It goes there in one of two plain postures (see `hvs_suite.datasets.planner.Planner`), the very
+ones that the policy's head is shown.
 
 Over a surface of unknown slope it goes around, or leans, on its way down, so that the eye in the
 hand sees the slope (see `hvs_suite.datasets.leaning`).
@@ -37,7 +37,6 @@ import numpy.typing as npt
 from hvs_suite.datasets.expert import Expert
 from hvs_suite.datasets.leaning import Straightening, raised, way_down
 from hvs_suite.datasets.planner import Planner
-from hvs_suite.registry import TASKS
 from hvs_suite.tasks.shared.family import GOAL_UNSEEN
 from hvs_suite.tasks.shared.goal import Goal
 from hvs_suite.tasks.shared.panels import PanelSpec
@@ -79,9 +78,7 @@ class Demonstrator(Expert):
 
     def __init__(self, env: Environment) -> None:
         spec = env.spec
-        named = TASKS.get(spec.name)
-        starts = {spec.start, named.start if named is not None else spec.start}
-        super().__init__(env, plain="random" in starts, clearance_m=CLEARANCE_M)
+        super().__init__(env, plain=True, clearance_m=CLEARANCE_M)
         # Leaning to all sides, the wrist of a plain posture would have to turn over.
         self._near_planner = Planner(
             self._period_s, embodiment=spec.embodiment, clearance_m=CLEARANCE_M
