@@ -15,7 +15,7 @@ Double precision: variances of a tenth of a millimetre and of half a metre meet 
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -105,6 +105,73 @@ class View:
     tan: float
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Ray:
+    """A sighting in space: what it says whatever is believed, so that many are computed at once.
+
+    Attributes:
+        visible: The logit that the target is in view, (B, 1).
+        origin: Of the camera, (B, 3) m.
+        along: Unit vector on which the target lies, (B, 3).
+        by_size: How far away it lies by its size (m), (B, 1).
+        share_var: Variance of that distance, as a share of it, (B, 1).
+        angle: Standard deviation across the ray (rad), (B, 1).
+        spread_m: The same at that distance, in the picture's plane (m), (B, 1).
+        outer: Projector onto the ray, (B, 3, 3).
+        rest: Projector onto what is across it, (B, 3, 3).
+        slope: Of the surface at the target, (B, 2).
+        slope_var: Its variance, (B, 1).
+        upward: Whether the normal that is seen points up, as that of a surface does, (B, 1) bool.
+        features: Of the sighting alone, (B, 6).
+    """
+
+    visible: Tensor
+    origin: Tensor
+    along: Tensor
+    by_size: Tensor
+    share_var: Tensor
+    angle: Tensor
+    spread_m: Tensor
+    outer: Tensor
+    rest: Tensor
+    slope: Tensor
+    slope_var: Tensor
+    upward: Tensor
+    features: Tensor
+
+    def steps(self, n: int) -> "list[Ray]":
+        """Rays of B windows one after the other, (B * n, ...), as those of each step, (B, ...)."""
+        fields = [field.name for field in dataclasses.fields(self)]
+        parts = [getattr(self, name).unflatten(0, (-1, n)).unbind(dim=1) for name in fields]
+        return [Ray(*step) for step in zip(*parts, strict=True)]
+
+    @torch.no_grad()
+    def likeliest(self, place: Tensor, P: Tensor, share_var: Tensor) -> Tensor:
+        """How far away it is most likely met (B, 1) m: by a Gaussian place, and by the size."""
+        d = self.along
+        Pd = (torch.linalg.inv(P) @ d[:, :, None])[:, :, 0]
+        weight = (Pd * d).sum(dim=1, keepdim=True)
+        at = (Pd * (place - self.origin)).sum(dim=1, keepdim=True)
+        size_weight = 1.0 / (share_var * self.by_size**2)
+        depth = (at + size_weight * self.by_size) / (weight + size_weight)
+        return depth.clamp(MIN_DEPTH_M, MAX_DEPTH_M)
+
+    def fit(self, place: Tensor, P: Tensor) -> Tensor:
+        """How it fits where its camera should show the target, (B, `FEATURES_A_CAMERA`)."""
+        offset = place - self.origin
+        along = (offset * self.along).sum(dim=1, keepdim=True)
+        miss_m = (offset - along * self.along).norm(dim=1, keepdim=True)
+        spread = torch.diagonal(P, dim1=1, dim2=2).sum(dim=1, keepdim=True)
+        doubt = torch.sqrt(spread + self.spread_m**2)
+        features = [
+            self.features,
+            0.2 * torch.log(miss_m / doubt + 1e-3),
+            0.2 * torch.log(miss_m + 1e-4),
+            (along / self.by_size - 1.0).clamp(-2.0, 2.0),
+        ]
+        return torch.cat(features, dim=1).float()
+
+
 class Belief(nn.Module):
     """The filter.
 
@@ -125,6 +192,8 @@ class Belief(nn.Module):
     offsets: Tensor
     drifts: Tensor
     transition: Tensor
+    unit: Tensor
+    restless: Tensor
 
     def __init__(
         self,
@@ -153,8 +222,14 @@ class Belief(nn.Module):
             start_off = torch.full((off,), 1e-4, dtype=torch.float64)
             self.register_buffer(name, start_off, persistent=off > 0)
         eye3 = torch.eye(3, dtype=torch.float64)
-        self._shown = [0, 1, 2, *range(N_MOTION, N_MOTION + off)]
-        transition = torch.eye(N_MOTION + off, dtype=torch.float64)
+        # What cameras show: the place, and how they are off. Without that a slice, which is fast.
+        offsets_at = range(N_MOTION, N_MOTION + off)
+        self._shown: slice | list[int] = [0, 1, 2, *offsets_at] if off else PLACE
+        unit = torch.eye(N_MOTION + off, dtype=torch.float64)
+        self.register_buffer("unit", unit, persistent=False)
+        restless = torch.tensor([1e-6] * 3 + [1e-3] * 3, dtype=torch.float64)
+        self.register_buffer("restless", restless, persistent=False)
+        transition = unit.clone()
         transition[PLACE, VELOCITY] = transition[VELOCITY, ACCELERATION] = period_s * eye3
         transition[PLACE, ACCELERATION] = 0.5 * period_s**2 * eye3
         self.register_buffer("transition", transition, persistent=False)
@@ -191,15 +266,12 @@ class Belief(nn.Module):
         start = torch.cat([self.prior, unknown, torch.diag(self.offsets).flatten()])
         return start.expand(n, self.size).clone()
 
-    def forward(
-        self, belief: Tensor, sightings: Mapping[str, Tensor], views: Mapping[str, View]
-    ) -> tuple[Tensor, Tensor]:
+    def forward(self, belief: Tensor, rays: Sequence[Ray]) -> tuple[Tensor, Tensor]:
         """One control step: what was believed goes on, and what is seen is taken in.
 
         Args:
             belief: (B, k) float64.
-            sightings: Camera name to (B, 9) of its eye.
-            views: Camera name to its pose.
+            rays: Of each camera, as `rays` makes them.
 
         Returns:
             What is believed now, (B, k), and the gates in (0, 1) that say how much was forgotten,
@@ -210,8 +282,7 @@ class Belief(nn.Module):
         x, P = self._state(belief)
         x, P = x @ F.T, F @ P @ F.T
         slope, slope_var = belief[:, TILT], belief[:, TILT_VARIANCE]
-        rays = [self._ray(i, sightings[c], views[c]) for i, c in enumerate(self.cameras)]
-        features = [_fit(ray, *self._as_shown(i, x, P, ray)[1:]) for i, ray in enumerate(rays)]
+        features = [ray.fit(*self._as_shown(i, x, P, ray)[1:]) for i, ray in enumerate(rays)]
         variances = torch.diagonal(P, dim1=1, dim2=2).clamp(min=1e-14)
         features.append(
             torch.cat([0.2 * variances.log(), 0.2 * slope_var.log(), slope], dim=1).float()
@@ -228,7 +299,7 @@ class Belief(nn.Module):
         prior_variance = torch.diagonal(prior_P)
         change = torch.exp((CHANGE_SLOPE * common[:, 1:]).clamp(-6.0, 6.0))
         # Velocities change by accelerations, and hardly otherwise.
-        of_prior = prior_variance[3:] * torch.tensor([1e-6] * 3 + [1e-3] * 3, dtype=P.dtype)
+        of_prior = prior_variance[3:] * self.restless
         q = torch.cat([1e-10 * change[:, :1].expand(n, 3), of_prior * change[:, 1:2]], dim=1)
         q = nn.functional.pad(q, (0, self._off))
         P = P + torch.diag_embed(q)
@@ -236,26 +307,31 @@ class Belief(nn.Module):
         slope_var = keep * slope_var + forget * start[TILT_VARIANCE] + 1e-8 * change[:, 2:]
         # What the cameras say of the place, as information.
         A = self._shown
-        info = P.new_zeros(n, len(A), len(A))
-        vector = P.new_zeros(n, len(A))
+        info, vector = [], []
         for i, ray in enumerate(rays):
             gate = gates[:, GATES_A_CAMERA * i : GATES_A_CAMERA * (i + 1)]
             H, place, spread = self._as_shown(i, x, P, ray)
-            Lambda, point = self._measure(i, ray, place, spread, gate)
-            info = info + H.transpose(1, 2) @ Lambda @ H
-            vector = vector + (H.transpose(1, 2) @ Lambda @ (point - place)[:, :, None])[:, :, 0]
-        eye = torch.eye(len(A), dtype=P.dtype)
-        middle = torch.linalg.inv(eye + info @ P[:, A][:, :, A])  # (I + L P)^-1
-        gain = P[:, :, A] @ middle  # acts on information
-        x = x + (gain @ vector[:, :, None])[:, :, 0]
-        P = P - gain @ info @ P[:, A, :]
-        P = 0.5 * (P + P.transpose(1, 2)) + 1e-13 * torch.eye(P.shape[1], dtype=P.dtype)
-        for i, ray in enumerate(rays):
-            gate = gates[:, GATES_A_CAMERA * i : GATES_A_CAMERA * (i + 1)]
-            seen, variance = self._facing(i, ray, gate)
+            there = _there(ray, gate)
+            Lambda, away = self._measure(i, ray, place, spread, gate, there)
+            told = (Lambda @ away[:, :, None])[:, :, 0]
+            if H is not None:
+                Lambda, told = H.transpose(1, 2) @ Lambda @ H, (told[:, None] @ H)[:, 0]
+            elif self._off:
+                Lambda = nn.functional.pad(Lambda, (0, self._off, 0, self._off))
+                told = nn.functional.pad(told, (0, self._off))
+            info.append(Lambda)
+            vector.append(told)
+            variance = self._slope_variance(i, ray, gate, there)
             share = slope_var / (slope_var + variance)
-            slope = slope + share * (seen - slope)
+            slope = slope + share * (ray.slope - slope)
             slope_var = slope_var * (1.0 - share)
+        told, Lambda = sum(vector[1:], vector[0]), sum(info[1:], info[0])
+        of_shown, unit = P[:, A], self.unit[: 3 + self._off, : 3 + self._off]
+        middle = torch.linalg.inv(unit + Lambda @ of_shown[:, :, A])  # (I + L P)^-1
+        gain = P[:, :, A] @ middle  # acts on information
+        x = x + (gain @ told[:, :, None])[:, :, 0]
+        P = P - gain @ Lambda @ of_shown
+        P = 0.5 * (P + P.transpose(1, 2)) + 1e-13 * self.unit
         m = MOTION
         updated = [x[:, m], P[:, m, m].flatten(1), slope, slope_var.clamp(min=1e-12)]
         if self._off:
@@ -288,68 +364,96 @@ class Belief(nn.Module):
         new_P = new_P + nn.functional.pad(own, (N_MOTION, 0, N_MOTION, 0))
         return torch.cat([start[MOTION].expand(len(x), -1), x[:, N_MOTION:]], dim=1), new_P
 
-    def _as_shown(self, i: int, x: Tensor, P: Tensor, ray: "_Ray") -> tuple[Tensor, Tensor, Tensor]:
+    def rays(self, sightings: Mapping[str, Tensor], views: Mapping[str, View]) -> list[Ray]:
+        """What each camera saw, in space.
+
+        Args:
+            sightings: Camera name to (B, 9) of its eye. No gradient flows through them.
+            views: Camera name to its pose.
+        """
+        with torch.no_grad():
+            return [self._ray(i, sightings[c], views[c]) for i, c in enumerate(self.cameras)]
+
+    def _ray(self, i: int, sighting: Tensor, view: View) -> Ray:
+        s = sighting.double()
+        uv = s[:, UV].clamp(-1.6, 1.6) * view.tan
+        ray = torch.cat([uv, torch.ones_like(uv[:, :1])], dim=1)
+        length = ray.norm(dim=1, keepdim=True)
+        along = (view.rotation @ (ray / length)[:, :, None])[:, :, 0]
+        by_size = self.sizes[i] * torch.exp(-s[:, LOG_DIAMETER].clamp(-6.0, 1.0)) * length
+        by_size = by_size.clamp(MIN_DEPTH_M, MAX_DEPTH_M)
+        sigma = s[:, LOG_SIGMA_UV].exp() * view.tan
+        outer = along[:, :, None] * along[:, None]
+        xy = s[:, SLOPE].clamp(-0.95, 0.95)
+        z = -torch.sqrt((1.0 - xy.square().sum(dim=1, keepdim=True)).clamp(min=0.05))
+        normal = (view.rotation @ torch.cat([xy, z], dim=1)[:, :, None])[:, :, 0]
+        up = normal[:, 2:]
+        visible = s[:, VISIBLE]
+        features = [
+            torch.tanh(visible / 4.0),
+            torch.tanh(visible / 20.0),
+            0.3 * s[:, LOG_SIGMA_UV],
+            0.3 * s[:, LOG_SIGMA_SIZE],
+            0.3 * s[:, LOG_SIGMA_SLOPE],
+            0.3 * by_size.log(),
+        ]
+        return Ray(
+            visible=visible,
+            origin=view.origin,
+            along=along,
+            by_size=by_size,
+            share_var=s[:, LOG_SIGMA_SIZE].exp() ** 2,
+            angle=sigma / length,
+            spread_m=sigma * by_size,
+            outer=outer,
+            rest=torch.eye(3, dtype=s.dtype) - outer,
+            slope=(normal[:, :2] / up.clamp(min=0.2)).clamp(-1.5, 1.5),
+            slope_var=s[:, LOG_SIGMA_SLOPE].clamp(-7.0, 2.0).exp() ** 2,
+            upward=up > 0.2,
+            features=torch.cat(features, dim=1),
+        )
+
+    def _as_shown(
+        self, i: int, x: Tensor, P: Tensor, ray: Ray
+    ) -> tuple[Tensor | None, Tensor, Tensor]:
         """Where a camera shows the target, (B, 3) m, and the covariance, (B, 3, 3).
 
         A camera taken to be at o that is shifted by -s and turned by -w, both small, shows a place
         p at p + s + w x (p - o). The way p - o is taken along the ray, by what is believed of p.
 
         Returns:
-            Before them, what of place and offsets this is, (B, 3, 3 + offsets).
+            Before them, what of place and offsets this is, (B, 3, 3 + offsets); None where it is
+            the place itself.
         """
+        if i not in self._of_offsets:
+            return None, x[:, PLACE], P[:, PLACE, PLACE]
         A = self._shown
-        H = torch.eye(3, len(A), dtype=P.dtype).repeat(len(x), 1, 1)
-        if i in self._of_offsets:
-            k = 3 + OFFSET_SIZE * self._of_offsets.index(i)
-            share_var = ray.sighting[:, LOG_SIGMA_SIZE].exp() ** 2
-            share_var = share_var + self.log_floors[i, 2].double().exp() ** 2
-            depth = ray.likeliest(x[:, PLACE], P[:, PLACE, PLACE], share_var)
-            H[:, :, k : k + 3] = torch.eye(3, dtype=P.dtype)
-            H[:, :, k + 3 : k + 6] = cross(-depth * ray.direction)
+        H = torch.eye(3, 3 + self._off, dtype=P.dtype).repeat(len(x), 1, 1)
+        k = 3 + OFFSET_SIZE * self._of_offsets.index(i)
+        share_var = ray.share_var + self.log_floors[i, 2].double().exp() ** 2
+        depth = ray.likeliest(x[:, PLACE], P[:, PLACE, PLACE], share_var)
+        H[:, :, k : k + 3] = torch.eye(3, dtype=P.dtype)
+        H[:, :, k + 3 : k + 6] = cross(-depth * ray.along)
         return H, (H @ x[:, A, None])[:, :, 0], H @ P[:, A][:, :, A] @ H.transpose(1, 2)
 
-    def _ray(self, i: int, sighting: Tensor, view: View) -> "_Ray":
-        """A sighting as a ray."""
-        s = sighting.double()
-        uv = s[:, UV].clamp(-1.6, 1.6) * view.tan
-        ray = torch.cat([uv, torch.ones_like(uv[:, :1])], dim=1)
-        length = ray.norm(dim=1, keepdim=True)
-        direction = (view.rotation @ (ray / length)[:, :, None])[:, :, 0]
-        by_size = self.sizes[i] * torch.exp(-s[:, LOG_DIAMETER].clamp(-6.0, 1.0)) * length
-        return _Ray(s, view, direction, length, by_size.clamp(MIN_DEPTH_M, MAX_DEPTH_M))
-
     def _measure(
-        self, i: int, ray: "_Ray", place: Tensor, P: Tensor, gate: Tensor
+        self, i: int, ray: Ray, place: Tensor, P: Tensor, gate: Tensor, there: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """What a ray says of the place: information (B, 3, 3), and the point on it (B, 3)."""
-        s, d = ray.sighting, ray.direction
-        log_floors = self.log_floors[i].double()
-        loud = torch.exp(2.0 * torch.tanh(gate[:, :3] / 2.0) * 2.0)  # of variances, e^-4 to e^4
-        share_var = (s[:, LOG_SIGMA_SIZE].exp() ** 2 + log_floors[2].exp() ** 2) * loud[:, 1:2]
+        """What a ray says of the place: information (B, 3, 3), and how far off it is (B, 3) m."""
+        floors = self.log_floors[i].double().exp() ** 2
+        loud = torch.exp(4.0 * torch.tanh(gate[:, :2] / 2.0))  # of variances, e^-4 to e^4
+        share_var = (ray.share_var + floors[2]) * loud[:, 1:]
         depth = ray.likeliest(place, P, share_var)
-        angle = s[:, LOG_SIGMA_UV].exp() * ray.view.tan / ray.length
-        across_var = ((angle**2 + log_floors[0].exp() ** 2) * depth**2) * loud[:, :1]
-        across_var = across_var + log_floors[1].exp() ** 2
-        along_var = share_var * ray.by_size**2 + log_floors[1].exp() ** 2
-        there = _there(s, gate)
-        outer = d[:, :, None] * d[:, None]
-        eye3 = torch.eye(3, dtype=P.dtype)
-        info = (eye3 - outer) / across_var[:, :, None] + outer / along_var[:, :, None]
-        return there[:, :, None] ** 2 * info, ray.view.origin + ray.by_size * d
+        across_var = (ray.angle**2 + floors[0]) * depth**2 * loud[:, :1] + floors[1]
+        along_var = share_var * ray.by_size**2 + floors[1]
+        info = ray.rest / across_var[:, :, None] + ray.outer / along_var[:, :, None]
+        return there[:, :, None] ** 2 * info, ray.origin + ray.by_size * ray.along - place
 
-    def _facing(self, i: int, ray: "_Ray", gate: Tensor) -> tuple[Tensor, Tensor]:
-        """What a sighting says of the slope (B, 2), and its variance (B, 1)."""
-        s = ray.sighting
-        xy = s[:, SLOPE].clamp(-0.95, 0.95)
-        z = -torch.sqrt((1.0 - xy.square().sum(dim=1, keepdim=True)).clamp(min=0.05))
-        normal = (ray.view.rotation @ torch.cat([xy, z], dim=1)[:, :, None])[:, :, 0]
-        up = normal[:, 2:]
-        slope = (normal[:, :2] / up.clamp(min=0.2)).clamp(-1.5, 1.5)
+    def _slope_variance(self, i: int, ray: Ray, gate: Tensor, there: Tensor) -> Tensor:
+        """Of the slope that a sighting tells, (B, 1)."""
         floor = self.log_floors[i, 3].double().exp()
-        variance = s[:, LOG_SIGMA_SLOPE].clamp(-7.0, 2.0).exp() ** 2 + floor**2
-        variance = variance * torch.exp(4.0 * torch.tanh(gate[:, 2:3] / 2.0))
-        there = _there(s, gate) * (up > 0.2)
-        return slope, variance / (there**2 + 1e-9)
+        variance = (ray.slope_var + floor**2) * torch.exp(4.0 * torch.tanh(gate[:, 2:3] / 2.0))
+        return variance / ((there * ray.upward) ** 2 + 1e-9)
 
     def normal(self, belief: Tensor) -> Tensor:
         """Unit normal of the surface at the target, (B, 3)."""
@@ -358,59 +462,14 @@ class Belief(nn.Module):
         return n / n.norm(dim=1, keepdim=True)
 
 
-def _there(sighting: Tensor, gate: Tensor) -> Tensor:
+def _there(ray: Ray, gate: Tensor) -> Tensor:
     """How far a sighting counts, (B, 1) in (0, 1), by the logit that the target is in view.
 
     Sharper than the probability, and the filter's network moves the logit by one at most. An eye
     makes the same mistake at every step, so what is worth next to nothing once would make the
     belief sure of a wrong place in forty steps.
     """
-    return torch.sigmoid(2.0 * (sighting[:, VISIBLE] + torch.tanh(gate[:, 3:])))
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Ray:
-    """On which a sighting says that the target lies, and how far away (m) by its size."""
-
-    sighting: Tensor
-    view: View
-    direction: Tensor
-    length: Tensor
-    by_size: Tensor
-
-    def likeliest(self, place: Tensor, P: Tensor, share_var: Tensor) -> Tensor:
-        """How far away it is most likely met (B, 1) m: by a Gaussian place, and by the size."""
-        d = self.direction
-        Pd = (torch.linalg.inv(P) @ d[:, :, None])[:, :, 0]
-        weight = (Pd * d).sum(dim=1, keepdim=True)
-        at = (Pd * (place - self.view.origin)).sum(dim=1, keepdim=True)
-        size_weight = 1.0 / (share_var * self.by_size**2)
-        depth = (at + size_weight * self.by_size) / (weight + size_weight)
-        return depth.clamp(MIN_DEPTH_M, MAX_DEPTH_M).detach()
-
-
-def _fit(ray: _Ray, place: Tensor, P: Tensor) -> Tensor:
-    """How a sighting fits where its camera should show the target, (B, `FEATURES_A_CAMERA`)."""
-    s, by_size = ray.sighting, ray.by_size
-    offset = place - ray.view.origin
-    along = (offset * ray.direction).sum(dim=1, keepdim=True)
-    miss_m = (offset - along * ray.direction).norm(dim=1, keepdim=True)
-    spread = torch.diagonal(P, dim1=1, dim2=2).sum(dim=1, keepdim=True).sqrt()
-    sigma_m = s[:, LOG_SIGMA_UV].exp() * ray.view.tan * by_size
-    doubt = torch.sqrt(spread**2 + sigma_m**2)
-    visible = s[:, VISIBLE]
-    features = [
-        torch.tanh(visible / 4.0),
-        torch.tanh(visible / 20.0),
-        0.3 * s[:, LOG_SIGMA_UV],
-        0.3 * s[:, LOG_SIGMA_SIZE],
-        0.3 * s[:, LOG_SIGMA_SLOPE],
-        0.3 * by_size.log(),
-        0.2 * torch.log(miss_m / doubt + 1e-3),
-        0.2 * torch.log(miss_m + 1e-4),
-        (along / by_size - 1.0).clamp(-2.0, 2.0),
-    ]
-    return torch.cat(features, dim=1).float()
+    return torch.sigmoid(2.0 * (ray.visible + torch.tanh(gate[:, 3:])))
 
 
 def belief_loss(

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from hvs_suite.policies.belief import geometry
-from hvs_suite.policies.belief.belief import BELIEF_SIZE, View, belief_loss
+from hvs_suite.policies.belief.belief import BELIEF_SIZE, belief_loss
 from hvs_suite.policies.belief.control_loss import (
     CHOICE_WEIGHT,
     TIP_WEIGHT,
@@ -93,15 +93,10 @@ def facing(network: BeliefNetwork, q: Tensor, truth: Recorded) -> dict[str, Tens
 
 def remembered(network: BeliefNetwork, window: Window) -> Tensor:
     """The memory at each step, its observation in it, (B, T, k) float64."""
-    n, length = window.counts.shape
-    q = window.state[..., :N_JOINTS]
-    motion = geometry.flange_motion(q.reshape(-1, N_JOINTS).double())
-    views = {
-        name: View(
-            view.origin.reshape(n, length, 3), view.rotation.reshape(n, length, 3, 3), view.tan
-        )
-        for name, view in network.views(motion).items()
-    }
+    q, length = window.state[..., :N_JOINTS], window.counts.shape[1]
+    views = network.views(geometry.flange_motion(q.flatten(0, 1).double()))
+    sightings = {name: sighting.flatten(0, 1) for name, sighting in window.sightings.items()}
+    rays = [ray.steps(length) for ray in network.belief.rays(sightings, views)]
     memory, memories = window.memory, []
     for t in range(length):
         memory = network.sent_on(memory, window.truth.set_point[:, t].double())
@@ -109,7 +104,7 @@ def remembered(network: BeliefNetwork, window: Window) -> Tensor:
             memory,
             {name: sighting[:, t] for name, sighting in window.sightings.items()},
             q[:, t],
-            {name: View(v.origin[:, t], v.rotation[:, t], v.tan) for name, v in views.items()},
+            [steps[t] for steps in rays],
         )
         memories.append(memory)
     return torch.stack(memories, dim=1)

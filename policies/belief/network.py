@@ -13,7 +13,7 @@ teach something.
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import torch
@@ -32,6 +32,7 @@ from hvs_suite.policies.belief.belief import (
     VELOCITY,
     Belief,
     Prior,
+    Ray,
     View,
 )
 from hvs_suite.policies.belief.colour_slope import ColourSlopeEye
@@ -323,7 +324,7 @@ class BeliefNetwork(nn.Module):
         memory: Tensor,
         sightings: Mapping[str, Tensor],
         q: Tensor,
-        views: Mapping[str, View] | None = None,
+        rays: Sequence[Ray] | None = None,
     ) -> Tensor:
         """Take an observation into the memory.
 
@@ -331,17 +332,19 @@ class BeliefNetwork(nn.Module):
             memory: (B, k), before it.
             sightings: Camera name to (B, 9).
             q: Measured joint positions, (B, 7) rad.
-            views: As `views` returns them for these; None computes them.
+            rays: As `hvs_suite.policies.belief.belief.Belief.rays` makes them of these; None
+                computes them.
 
         Returns:
             (B, k).
         """
         q = self._joints(memory, q)
-        if views is None or not self.shape.reads_positions:
+        if rays is None or not self.shape.reads_positions:
             views = self.views(geometry.flange_motion(q.double()))
+            rays = self.belief.rays(sightings, views)
         offsets = memory.shape[1] - (self.belief.size - BELIEF_SIZE)
         before = torch.cat([memory[:, :BELIEF_SIZE], memory[:, offsets:]], dim=1)
-        believed, forget = self.belief(before, sightings, views)
+        believed, forget = self.belief(before, rays)
         begun = memory[:, BEGUN] > 0
         set_point, trailing = (
             torch.where(begun, memory[:, part], q.double()) for part in (SET_POINT, TRAILING)
