@@ -14,6 +14,7 @@ from frames import assert_same_frames, columns
 
 import hvs_suite
 from hvs_suite.datasets.demonstration import MakeEnvironment
+from hvs_suite.datasets.looking import Demonstrator
 from hvs_suite.datasets.metadata import METADATA_FILE, read_metadata
 from hvs_suite.datasets.recorder import record
 from hvs_suite.datasets.writer import STAGE
@@ -112,12 +113,10 @@ def test_noise_changes_what_is_done_and_not_what_is_taught(tmp_path):
     taught, done = np.array(frames["action"]), np.array(frames["privileged.action_executed"])
     assert np.abs(taught - done).max() > 1e-3
     with hvs_suite.load("align-easy", observations="state") as env:
-        from hvs_suite.datasets.expert import make_expert
-
-        expert = make_expert(env)
+        demonstrator = Demonstrator(env)
         env.reset(scenario=0)
         for i in range(3):
-            np.testing.assert_allclose(expert.label(), taught[i], atol=1e-6)
+            np.testing.assert_allclose(demonstrator.label(), taught[i], atol=1e-6)
             env.step(np.float32(done[i]))
     assert read_metadata(tmp_path / "noisy").noise == 0.05
 

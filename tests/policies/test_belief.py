@@ -89,7 +89,7 @@ def after(
     now = belief.start(1)
     with torch.no_grad():
         for view, target in zip(views, targets, strict=True):
-            now, _ = belief(now, {"eih": seen(view, target, **doubts)}, {"eih": view})
+            now, _ = belief(now, belief.rays({"eih": seen(view, target, **doubts)}, {"eih": view}))
     return now
 
 
@@ -157,7 +157,7 @@ def test_the_covariance_stays_one_over_a_long_episode() -> None:
             height = random.uniform(0.05, 0.8)
             view = from_above((*(height * random.uniform(-0.4, 0.4, 2)), height))
             sighting = seen(view, (0.01, 0.02, 0.0), visible=float(random.choice([-12.0, 12.0])))
-            now, _ = belief(now, {"eih": sighting}, {"eih": view})
+            now, _ = belief(now, belief.rays({"eih": sighting}, {"eih": view}))
     P = now[0, COVARIANCE].view(N_MOTION, N_MOTION)
     assert torch.isfinite(now).all()
     np.testing.assert_allclose(P, P.T)
@@ -177,7 +177,7 @@ def test_how_a_camera_is_shifted_and_turned_is_known_of_the_next_targets() -> No
         sightings = {"eih": seen(near, tuple(target), visible=visible)}
         sightings["eth"] = seen(far, tuple(target + off(target)), sigma_uv=1e-3, sigma_size=3.0)
         with torch.no_grad():
-            return belief(now, sightings, {"eih": near, "eth": far})[0]
+            return belief(now, belief.rays(sightings, {"eih": near, "eth": far}))[0]
 
     def doubt(now: torch.Tensor) -> float:
         return now[0, COVARIANCE].view(N_MOTION, N_MOTION)[0, 0].sqrt().item()
