@@ -118,7 +118,8 @@ class Shape:
             (m).
         reads_positions: Whether measured joint positions are read; without them the network knows
             where the arm starts, and from there on where it has sent it.
-        reads_velocities: Whether measured joint velocities are read; without them they count as 0.
+        reads_velocities: Whether measured joint velocities are read; without them the network
+            knows how far the arm trails where it has been sent.
         slopes: Cameras whose eyes tell slopes. With any, the head may let the tool lean about the
             target.
         slopes_by: What they tell them by: moments of the picture's ``contrasts``
@@ -568,18 +569,22 @@ class BeliefNetwork(nn.Module):
         return torch.where(memory[:, BEGUN] > 0, memory[:, TRAILING].to(q.dtype), q)
 
     def _read(self, memory: Tensor, state: Tensor) -> Tensor:
-        """The state (B, 14) without what the network does not read of it."""
-        q, velocity = state[:, :N_JOINTS], state[:, N_JOINTS:]
+        """The state (B, 14), with what the network does not read of it reckoned."""
+        q, velocity = self._joints(memory, state[:, :N_JOINTS]), state[:, N_JOINTS:]
         if not self.shape.reads_velocities:
-            velocity = torch.zeros_like(velocity)
-        return torch.cat([self._joints(memory, q), velocity], dim=1)
+            velocity = self._trailing_velocity(memory, q)
+        return torch.cat([q, velocity], dim=1)
+
+    def _trailing_velocity(self, memory: Tensor, q: Tensor) -> Tensor:
+        """How fast joints at q (B, 7) rad go after where they were sent to, (B, 7) rad/s."""
+        return ((memory[:, SET_POINT] - q) / self.lag_s).to(torch.float32)
 
     def _moving(self, memory: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """Joints (B, 7) rad and their velocities (rad/s) when the next action takes effect."""
         if not self.cell.latency_steps:
             return state[:, :N_JOINTS], state[:, N_JOINTS:]
         trailing = memory[:, TRAILING]
-        return trailing.float(), ((memory[:, SET_POINT] - trailing) / self.lag_s).float()
+        return trailing.float(), self._trailing_velocity(memory, trailing)
 
     def _place(self, memory: Tensor, q: Tensor) -> _Place:
         """Where the tip is by measured joints (B, 7) and set point, and where it has to go."""

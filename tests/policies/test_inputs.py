@@ -48,3 +48,31 @@ def test_without_positions_the_arm_is_reckoned_from_where_it_started() -> None:
     memory = network.commanded(memory, (q + 0.05) / network.joint_range)
     reckoned = network._joints(memory, torch.zeros(1, 7))
     assert ((reckoned > 0.3) & (reckoned < 0.35)).all()
+
+
+def test_without_velocities_they_are_reckoned_from_how_far_the_arm_trails() -> None:
+    task = "align-easy"
+    network = BeliefNetwork(
+        Shape(CAMERAS, hidden=8, reads_velocities=False), cell_model(hvs_suite.TASKS[task])
+    )
+    memory = network.start(1)
+    unseen = {name: torch.zeros(1, 9) for name in CAMERAS}
+    errors = []
+    with hvs_suite.load(task, split="dev") as env:
+        shown = env.reset(scenario=0).observation
+        start = shown["joint_positions"]
+        for step in range(1, 9):
+            q, velocity = (
+                torch.from_numpy(shown[name])[None].float()
+                for name in ("joint_positions", "joint_velocities")
+            )
+            memory = network.remember(memory, unseen, q)
+            reckoned = network._read(memory, torch.cat([q, torch.zeros(1, 7)], dim=1))
+            errors.append((reckoned[0, 7:] - velocity[0]).abs().max().item())
+            # It turns the first joint, faster and faster.
+            action = torch.from_numpy(start)[None].float() / network.joint_range
+            action[0, 0] += 0.002 * step**2
+            memory = network.commanded(memory, action)
+            shown = env.step(action[0].numpy()).observation
+    assert abs(velocity[0, 0].item()) > 0.3
+    assert max(errors) < 0.003
