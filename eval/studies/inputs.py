@@ -4,10 +4,9 @@ Actions are joint positions, so a policy that is given none still knows what it 
 the joints from there and from where the arm starts: in two episodes of the expert on each task to
 1.4 mrad, which is a millimetre at the tip. Velocities it reckons from how far the arm trails.
 
-Budget: on one core a cell on ``align-thesis`` took 5 to 10 minutes to train and 1 to play
-(docs/answers.md), so twelve of them with two seeds take 3 hours on one core. Those on
-``track-line``, which were not timed, learn half as many steps and begin with the eyes of the
-shipped weights.
+Budget: on one core a cell on ``align-thesis`` took 5 to 10 minutes to train and 1 to play, and one
+on ``track-line``, which learns half as many steps and begins with the eyes of the shipped weights,
+4 to 8 minutes and 1 (docs/answers.md). So twelve of each with two seeds take 6 hours on one core.
 """
 
 from hvs_suite.eval.studies.grid import Cell, Plan
