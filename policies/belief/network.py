@@ -576,7 +576,10 @@ class BeliefNetwork(nn.Module):
         return torch.cat([q, velocity], dim=1)
 
     def _trailing_velocity(self, memory: Tensor, q: Tensor) -> Tensor:
-        """How fast joints at q (B, 7) rad go after where they were sent to, (B, 7) rad/s."""
+        """How fast joints at q (B, 7) rad go after where they were sent to, (B, 7) rad/s.
+
+        With latency this is as if what was sent already took effect.
+        """
         return ((memory[:, SET_POINT] - q) / self.lag_s).to(torch.float32)
 
     def _moving(self, memory: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
