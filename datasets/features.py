@@ -15,7 +15,6 @@ feature                                   dtype, shape    meaning
 ``privileged.goal_normal``                float32 (3,)    outward surface normal there
 ``privileged.joint_offset``               float32 (7,)    zero errors of the encoders (rad), if any
 ``privileged.goal_unseen``                float32 (3,)    goal less where pictures show it, if it is
-``privileged.obstacles``                  float32 (49,)   upright boxes that stand around, if any
 ``privileged.<keypoint>_<camera>``        float32 (4,)    in the image: u, v, diameter, seen
 ``privileged.errors``                     float32 (k,)    the task's metrics at this frame
 ========================================  ==============  ========================================

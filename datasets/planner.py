@@ -63,8 +63,8 @@ _MAX_PATHS = 24
 _MAX_PATHS_AMONG_OBSTACLES = 4
 """Straight ways that are tried before the roadmap is asked."""
 _MAX_VIAS = 40
-_KEPT_ROADMAPS = 8
-"""Of an episode: over the goal and at it, before and after an obstacle moves, of both kinds."""
+_KEPT_ROADMAPS = 4
+"""Of an episode: over the goal and at it, before and after an obstacle moves."""
 _MAX_ESCAPES = 4
 _MAX_FLANGE_SPEED_M_S = 2.5
 _PATH_STEP_S = 0.02
@@ -169,7 +169,7 @@ class Planner:
         self._clearance_m = 0.0
         """Of the present state."""
         self._solids: tuple[Solid, ...] = ()
-        self._roadmaps: dict[tuple[tuple[Solid, ...], bytes, bool], Roadmap] = {}
+        self._roadmaps: dict[tuple[tuple[Solid, ...], bytes], Roadmap] = {}
         self._soonest_s = math.inf
         """What the soonest way to the goal took a control step ago (s)."""
         self._ruckig = ruckig.Ruckig(7)
@@ -339,23 +339,18 @@ class Planner:
 
     def _vias(self, q: FloatArray, velocity: FloatArray, goal: Goal) -> Iterator[FloatArray]:
         """Postures (7,) to head for where the goal's own cannot be reached straight."""
-        rest = self._where_braking_ends(q, velocity)[6]
-        last = min(max(rest, -robot.JOINT_RANGE_RAD[6]), robot.JOINT_RANGE_RAD[6])
-        for plain in (True, False) if self._plain else (False,):
-            roadmap = self._roadmap(goal, plain=plain)
-            nodes = roadmap.nodes[:, :6].T
-            times, effort = _stopping_travel_time(q[:6], velocity[:6], nodes, self._acceleration)
-            for node in roadmap.candidates(times + TIE_BREAK_S * effort):
-                yield np.append(node[:6], last)
-
-    def _roadmap(self, goal: Goal, *, plain: bool) -> Roadmap:
-        """The roadmap to a goal among what there is, made once."""
-        key = self._solids, goal.position.tobytes() + goal.normal.tobytes(), plain
+        key = self._solids, goal.position.tobytes() + goal.normal.tobytes()
         if key not in self._roadmaps:
             while len(self._roadmaps) >= _KEPT_ROADMAPS:
                 del self._roadmaps[next(iter(self._roadmaps))]
-            self._roadmaps[key] = Roadmap(self._clearance, goal, plain=plain)
-        return self._roadmaps[key]
+            self._roadmaps[key] = Roadmap(self._clearance, goal)
+        roadmap = self._roadmaps[key]
+        nodes = roadmap.nodes[:, :6].T
+        times, effort = _stopping_travel_time(q[:6], velocity[:6], nodes, self._acceleration)
+        rest = self._where_braking_ends(q, velocity)[6]
+        last = min(max(rest, -robot.JOINT_RANGE_RAD[6]), robot.JOINT_RANGE_RAD[6])
+        for node in roadmap.candidates(times + TIE_BREAK_S * effort):
+            yield np.append(node[:6], last)
 
     def _remember_goal(self, goal: Goal, among: BoolArray | None = None) -> None:
         """Computes the goal's family of configurations once a goal.

@@ -40,7 +40,6 @@ _STEP_RAD = 0.06
 _N_SWIVEL = 48
 _N_GOALS = 32
 _DISTINCT_RAD = 0.25
-_PLAIN_RAISES_M = (0.05, 0.15, 0.30, 0.45)
 _RAISES_M = (0.12, 0.28)
 """Ways to a goal come from above it, so there are postures there, too."""
 
@@ -51,29 +50,18 @@ class Roadmap:
     Args:
         clearance: Of the scene.
         goal: Where they lead.
-        plain: Lead through plain postures alone: upright, and above the goal.
     """
 
-    def __init__(self, clearance: Clearance, goal: Goal, *, plain: bool = False) -> None:
+    def __init__(self, clearance: Clearance, goal: Goal) -> None:
         self._clearance = clearance
-        goals: list[FloatArray]
-        if plain:
-            vias: FloatArray = np.zeros((1, 7))
-            goals = _plain_postures(goal.position, goal)
-            above = [
-                posture
-                for rise in _PLAIN_RAISES_M
-                for posture in _plain_postures(goal.position + rise * goal.normal, goal)
-            ]
-        else:
-            vias = _via_points()
-            goals = self._goal_postures(goal)
-            above = [
-                _with_zero(near)
-                for rise in _RAISES_M
-                for q in goals
-                if (near := _raised(q, goal, rise)) is not None
-            ]
+        vias = _via_points()
+        goals = self._goal_postures(goal)
+        above = [
+            _with_zero(near)
+            for rise in _RAISES_M
+            for q in goals
+            if (near := _raised(q, goal, rise)) is not None
+        ]
         self.nodes = np.array([*vias, *above, *goals])
         """Postures (n, 7) rad, the last joint at zero."""
         self._n_goals = len(goals)
@@ -201,14 +189,6 @@ def _raised(q: FloatArray, goal: Goal, rise_m: float) -> FloatArray | None:
     """The posture above a goal that is nearest to one at the goal."""
     above = goal.position + rise_m * goal.normal
     return kinematics().nearest_configuration(q, above, goal.normal, robot.JOINT_SPEED_RAD_S)
-
-
-def _plain_postures(place: FloatArray, goal: Goal) -> list[FloatArray]:
-    """The plain postures at a place (3,) m over a goal, (7,) rad each."""
-    return [
-        _with_zero(q)
-        for q in kinematics().goal_configurations_at_tool_angle(place, goal.normal, 0.0, n_swivel=1)
-    ]
 
 
 def _with_zero(q: FloatArray) -> FloatArray:

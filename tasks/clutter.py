@@ -23,7 +23,7 @@ from hvs_suite.errors import OptionError
 from hvs_suite.tasks.shared import robustness
 from hvs_suite.tasks.shared.family import register
 from hvs_suite.tasks.shared.goal import Goal
-from hvs_suite.tasks.shared.obstacles import OBSTACLES, Obstacles, ObstaclesSpec
+from hvs_suite.tasks.shared.obstacles import Obstacles, ObstaclesSpec
 from hvs_suite.tasks.shared.placing import HARD, Placing, PlacingSpec
 from hvs_suite.tasks.shared.props import Placed, Props
 from hvs_suite.tasks.shared.robustness import Axis
@@ -230,10 +230,6 @@ class Clutter(Placing[ClutterSpec, ClutterScenario]):
     def obstacles(self) -> tuple["Solid", ...]:
         """All obstacles; the one that moves with all its lane until it rests."""
         return self._obstacles.present()
-
-    def privileged(self) -> dict[str, FloatArray]:
-        """Where obstacles stand."""
-        return {OBSTACLES: self._obstacles.boxes()} if self.spec.n_obstacles[1] else {}
 
     @classmethod
     def certify(cls, env: "Environment", scenarios: Iterable[int]) -> list["Check"]:

@@ -53,7 +53,6 @@ class Pretrain(Players):
             lean.
         offsets: Cameras whose pose is not exact, joined by +: the belief finds out how they are
             shifted and turned; for targets in sequence.
-        obstacles: Cameras whose eyes tell what stands around, joined by +: eth. For obstacles.
         batch_size: Frames that the eyes learn from in a step.
         device: Where the eyes learn: cpu or cuda. The rest learns on the processor.
         learning_rate: Peak of the schedule.
@@ -78,7 +77,6 @@ class Pretrain(Players):
     eye_share: float = 0.5
     slopes: str | None = None
     offsets: str | None = None
-    obstacles: str | None = None
     batch_size: int = 64
     device: str = "cpu"
     learning_rate: float = 2e-3
@@ -111,7 +109,6 @@ class Pretrain(Players):
                 eye_share=self.eye_share,
                 slopes=() if self.slopes is None else tuple(self.slopes.split("+")),
                 offsets=() if self.offsets is None else tuple(self.offsets.split("+")),
-                obstacles=() if self.obstacles is None else tuple(self.obstacles.split("+")),
                 batch_size=self.batch_size,
                 learning_rate=self.learning_rate,
                 workers=self.players(local=2),

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from hvs_suite.policies.belief.eye import SIGHTING_SIZE
 from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
 from hvs_suite.policies.belief.residual import N_LENGTHS
 
@@ -139,7 +140,7 @@ class CompiledParts:
         images = tuple(torch.zeros(1, c, side, side) for c, side in shape.cameras.values())
         state, memory = torch.zeros(1, 2 * N_JOINTS), network.start(1)
         goal, felt = torch.zeros(1, shape.n_goals), torch.zeros(1, shape.n_felt)
-        sightings = tuple(torch.zeros(1, network.sighting_size(n)) for n in self._cameras)
+        sightings = tuple(torch.zeros(1, SIGHTING_SIZE) for _ in self._cameras)
         share = torch.zeros(1, N_LENGTHS)
         self._perceives = _compiled(_Perceives(network), (images, state, memory, goal, felt))
         self._responds = _compiled(_Responds(network), (memory, sightings, state, share, felt))

@@ -141,41 +141,18 @@ def way_to_posture(q: Tensor, flange: Tensor, normal: Tensor) -> tuple[Tensor, T
         normal: Unit normal that it should face, (B, 3). No gradient flows through it.
 
     Returns:
-        As `ways_to_postures`, of one.
-    """
-    (turns, time_s, within), (others, other_s, other_within) = ways_to_postures(q, flange, normal)
-    is_first = time_s + UNREACHABLE_S * (1.0 - within) <= other_s + UNREACHABLE_S * (
-        1.0 - other_within
-    )
-    return (
-        torch.where(is_first, turns, others),
-        torch.where(is_first, time_s, other_s),
-        torch.where(is_first, within, other_within),
-    )
-
-
-def ways_to_postures(
-    q: Tensor, flange: Tensor, normal: Tensor
-) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """The ways to the two plain postures (see `postures`).
-
-    Args:
-        q: Joint angles, (B, 7) rad.
-        flange: Where it should be, (B, 3) m. No gradient flows through it.
-        normal: Unit normal that it should face, (B, 3). No gradient flows through it.
-
-    Returns:
-        Of each, the turns of A1 to A6 that are left, (B, 6) rad, the time of the slowest, (B, 1) s,
-        and 1 if that posture lies within the ranges, else 0, (B, 1).
+        The turns of A1 to A6 that are left, (B, 6) rad, the time of the slowest, (B, 1) s, and 1 if
+        that posture lies within the ranges, else 0, (B, 1).
     """
     speed = torch.as_tensor(JOINT_SPEED_RAD_S[:-1]).to(q)
     limit = torch.as_tensor(JOINT_RANGE_RAD[:-1]).to(q)
-    both = []
-    for ends in postures(flange, normal).unbind(dim=1):
-        turns = ends - q[:, :-1]
-        time_s = (turns.abs() / speed).amax(dim=1, keepdim=True)
-        both.append((turns, time_s, (ends.abs() <= limit).all(dim=1, keepdim=True).to(q)))
-    return both
+    ends = postures(flange, normal)
+    ways = ends - q[:, None, :-1]
+    times = (ways.abs() / speed).amax(dim=2)
+    within = (ends.abs() <= limit).all(dim=2)
+    nearer = torch.where(within, times, times + UNREACHABLE_S).argmin(dim=1)
+    row = torch.arange(len(q), device=q.device)
+    return ways[row, nearer], times[row, nearer, None], within[row, nearer, None].to(q)
 
 
 def along_way(turns: Tensor, velocity: Tensor, time_s: float, *, together: bool = True) -> Tensor:

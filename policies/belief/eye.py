@@ -82,7 +82,6 @@ class Eye(nn.Module):
         n_goals: Length of the one-hot vector that says which target is meant; 0 for none.
         slope: What tells slopes of what it sees, and learns it by itself; None where the features
             have to do so.
-        surroundings: What tells from the features what stands around; None for nothing.
 
     Attributes:
         channels: Channels of the features.
@@ -100,7 +99,6 @@ class Eye(nn.Module):
         n_goals: int = 0,
         *,
         slope: nn.Module | None = None,
-        surroundings: nn.Module | None = None,
     ) -> None:
         super().__init__()
         self.channels = channels
@@ -134,7 +132,6 @@ class Eye(nn.Module):
         n_around = PATCH_CHANNELS * PATCH_SIZE**2 + 4 * N_POINTS
         self.judge = nn.Sequential(nn.Linear(2 * channels + n_around + 5, 128), nn.SiLU(), last)
         self.slope = slope
-        self.surroundings = surroundings
 
     def forward(self, images: Tensor, goal: Tensor | None = None) -> Tensor:
         """Look.
@@ -175,12 +172,7 @@ class Eye(nn.Module):
         if self.slope is not None and not self.training:
             bright = images.float() / 255.0 if images.dtype == torch.uint8 else images
             facing = self.slope(bright - 0.5, uv, size)
-        said = [uv, size, judged[:, 3 : SLOPE.start], facing]
-        if self.surroundings is not None:
-            with self._quickly(maps.device):
-                around = self.surroundings(maps)
-            said.append(around.float())
-        return Seen(torch.cat(said, dim=1), scores)
+        return Seen(torch.cat([uv, size, judged[:, 3 : SLOPE.start], facing], dim=1), scores)
 
     def attention(self, images: Tensor, goal: Tensor | None = None) -> Tensor:
         """The distribution over cells whose mean is where the target is looked for first.
@@ -195,24 +187,16 @@ class Eye(nn.Module):
         scores = self.see(images, goal).scores
         return torch.softmax(scores.flatten(1), dim=1).view_as(scores)
 
-    @property
-    def _quickly_now(self) -> bool:
-        return self.train_in_bfloat16 and self.training
-
-    def _quickly(self, device: torch.device) -> torch.autocast:
-        """Where convolutions are to be computed in bfloat16, if they are."""
-        return torch.autocast(device.type, dtype=torch.bfloat16, enabled=self._quickly_now)
-
     def _maps(self, images: Tensor, goal: Tensor | None) -> Tensor:
         """Features of every cell, (B, h, w, channels)."""
-        half = self._quickly_now
+        half = self.train_in_bfloat16 and self.training
         if images.dtype == torch.uint8:
             # Bytes less their mean are exact in bfloat16, and half the size to begin with.
             x = images.to(torch.bfloat16 if half else torch.float32).sub_(127.5).mul_(1.0 / 255.0)
         else:
             x = images - 0.5
         x = x.contiguous(memory_format=torch.channels_last)
-        with self._quickly(x.device):
+        with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=half):
             maps: Tensor = self.features(x)
         maps = maps.float().permute(0, 2, 3, 1)
         if self.asked_for is not None and goal is not None:

@@ -53,35 +53,6 @@ class FlangeMotion:
     jacobian: Tensor
 
 
-def _frames(q: Tensor) -> tuple[Tensor, Tensor]:
-    """The frame before each joint's turn, and the flange's: axes (B, 8, 3, 3), places (B, 8, 3)."""
-    fixed, sine, cosine, ways, _ = (table.to(q) for table in _JOINTS)
-    angle = q[:, :, None, None]
-    turns = fixed + sine * torch.sin(angle) + cosine * torch.cos(angle)  # (B, 7, 3, 3)
-    frames = [torch.eye(3, dtype=q.dtype, device=q.device).expand(len(q), 3, 3)]
-    for turn in turns.unbind(dim=1):
-        frames.append(frames[-1] @ turn)
-    rotations = torch.stack(frames, dim=1)
-    return rotations, torch.cumsum(rotations[..., 2] * ways, dim=1)
-
-
-def along_links(q: Tensor) -> Tensor:
-    """Points along the arm, from the middle of the upper arm to the flange.
-
-    Args:
-        q: Joint angles, (B, 7) rad.
-
-    Returns:
-        (B, 8, 3) m.
-    """
-    places = _frames(q)[1]
-    shoulder, elbow, wrist, flange = (places[:, i] for i in (1, 3, 5, 7))
-    points = [0.5 * (shoulder + elbow), elbow]
-    points += [elbow + share * (wrist - elbow) for share in (0.25, 0.5, 0.75, 1.0)]
-    points += [0.5 * (wrist + flange), flange]
-    return torch.stack(points, dim=1)
-
-
 def flange_motion(q: Tensor) -> FlangeMotion:
     """Forward kinematics as a product of seven joint rotations, all axes meeting the z line.
 
@@ -91,8 +62,15 @@ def flange_motion(q: Tensor) -> FlangeMotion:
     Returns:
         Pose and geometric Jacobian of the flange.
     """
-    rotations, places = _frames(q)
-    joint_axes = _JOINTS[-1].to(q)
+    fixed, sine, cosine, ways, joint_axes = (table.to(q) for table in _JOINTS)
+    angle = q[:, :, None, None]
+    turns = fixed + sine * torch.sin(angle) + cosine * torch.cos(angle)  # (B, 7, 3, 3)
+    # The frame before each joint's turn, and the flange's.
+    frames = [torch.eye(3, dtype=q.dtype, device=q.device).expand(len(q), 3, 3)]
+    for turn in turns.unbind(dim=1):
+        frames.append(frames[-1] @ turn)
+    rotations = torch.stack(frames, dim=1)  # (B, 8, 3, 3)
+    places = torch.cumsum(rotations[..., 2] * ways, dim=1)  # (B, 8, 3)
     position = places[:, -1]
     axes = (rotations[:, :-1] @ joint_axes[..., None])[..., 0]  # (B, 7, 3)
     linear = torch.linalg.cross(axes, position[:, None] - places[:, :-1], dim=2)

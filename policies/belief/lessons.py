@@ -19,10 +19,9 @@ from hvs_suite.policies.belief.control_loss import (
     choice_loss,
     tip_loss,
 )
-from hvs_suite.policies.belief.eye import SIGHTING_SIZE, Seen, sighting_loss
+from hvs_suite.policies.belief.eye import Seen, sighting_loss
 from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
 from hvs_suite.policies.belief.recorded import Recorded
-from hvs_suite.policies.belief.surroundings import surroundings_loss
 
 Parts = dict[str, Tensor]
 
@@ -70,9 +69,6 @@ def eye_lesson(
         target = truth.targets[name].to(device)
         loss, _ = sighting_loss(seen[name], target, normal.to(device))
         parts[f"{name}_loss"] = loss
-        if name in network.shape.obstacles and truth.obstacles is not None:
-            said = seen[name].sighting[:, SIGHTING_SIZE:]
-            parts[f"{name}_obstacles_loss"] = surroundings_loss(said, truth.obstacles.to(device))
     return torch.stack(list(parts.values())).sum(), parts
 
 

@@ -36,18 +36,10 @@ from hvs_suite.policies.belief.belief import (
     View,
 )
 from hvs_suite.policies.belief.colour_slope import ColourSlopeEye
-from hvs_suite.policies.belief.eye import (
-    LOG_DIAMETER,
-    SIGHTING_SIZE,
-    UV,
-    VISIBLE,
-    Eye,
-    Seen,
-)
+from hvs_suite.policies.belief.eye import LOG_DIAMETER, UV, VISIBLE, Eye, Seen
 from hvs_suite.policies.belief.geometry import FlangeMotion
 from hvs_suite.policies.belief.residual import RESIDUAL_SIZE, SHIFT, Residual, goal_axes
 from hvs_suite.policies.belief.slope import SlopeEye
-from hvs_suite.policies.belief.surroundings import SIZE, SurroundingsEye, blocked
 
 N_JOINTS = 7
 ACTION_UNITS = 2.0**20
@@ -72,16 +64,6 @@ LEANING_HEIGHTS_M = (0.006, 0.15)
 """Where slopes are to be seen, the head is also shown plain postures that lean away from the base,
 by this tangent, and stand so far above the goal. Demonstrations that look from the side come down
 so (`hvs_suite.datasets.leaning.Straightening`)."""
-FURTHER_HEIGHTS_M = (0.30, 0.45)
-"""Where obstacles are to be seen, the head is also shown plain postures so far above the goal, both
-plain postures at each height instead of the nearer, and the way to the upright arm."""
-SHARES = tuple((k + 1) / 12 for k in range(12))
-"""Of a way, at which it is held against what stands around."""
-LINK_M = 0.08
-"""Radius of balls along the arm that hold it."""
-SUREST = 0.98
-"""A way that is met for sure is as unlikely to lead on as the rest of this."""
-WAY_CHECKED = len(SHARES) + 1
 RECENT_SIZE = 4
 """What is remembered beside belief and set point: for how long each camera has not seen the target
 (two), and a trace of what was forgotten (two)."""
@@ -145,9 +127,6 @@ class Shape:
             (`hvs_suite.policies.belief.colour_slope`).
         offsets: Cameras whose pose is not exact, and of which the belief finds out how they are
             shifted and turned.
-        obstacles: Cameras, of those that do not move, whose eyes tell what stands around
-            (`hvs_suite.policies.belief.surroundings`). With any, the head weighs more ways, each
-            with how likely the arm meets something on it.
     """
 
     cameras: Mapping[str, tuple[int, int]]
@@ -164,7 +143,6 @@ class Shape:
     slopes: tuple[str, ...] = ()
     slopes_by: Literal["contrasts", "colour"] = "contrasts"
     offsets: tuple[str, ...] = ()
-    obstacles: tuple[str, ...] = ()
 
 
 MEMORY_SIZE = BELIEF_SIZE + 2 * N_JOINTS + 2 + RECENT_SIZE
@@ -223,14 +201,7 @@ class BeliefNetwork(nn.Module):
         cameras = tuple(shape.cameras)
         self.eyes = nn.ModuleDict(
             {
-                n: Eye(
-                    c,
-                    side,
-                    shape.channels,
-                    shape.n_goals,
-                    slope=self._slope_eye(n),
-                    surroundings=self._surroundings_eye(n),
-                )
+                n: Eye(c, side, shape.channels, shape.n_goals, slope=self._slope_eye(n))
                 for n, (c, side) in shape.cameras.items()
             }
         )
@@ -252,9 +223,7 @@ class BeliefNetwork(nn.Module):
         width += shape.n_felt * 2
         width += self._sees_slopes  # the time
         self.width = width
-        n_ways = len(self._heights_m) + self._sees_slopes * len(LEANING_HEIGHTS_M)
-        if shape.obstacles:
-            n_ways *= 2
+        n_ways = len(HEIGHTS_M) + self._sees_slopes * len(LEANING_HEIGHTS_M)
         way_width = n_ways * (2 * (N_JOINTS - 1) + 2)
         # To which point by the goal: sideways (two) and along the normal, how far ahead, and what
         # is added for where the tip is, and where it was sent.
@@ -270,11 +239,9 @@ class BeliefNetwork(nn.Module):
         self.lead_s = nn.Parameter(torch.tensor(0.1))
         self.feedback = nn.Parameter(torch.zeros(2))
         n_proposals = 1 + n_ways
-        n_proposals += len(self._fixed_postures())
-        way_width += 2 * N_JOINTS * len(self._fixed_postures())
-        if shape.obstacles:
-            way_width += WAY_CHECKED * n_proposals
-            self.caution = nn.Parameter(torch.tensor(2.0))
+        if cell.look_out_rad is not None:
+            n_proposals += 1
+            way_width += 2 * N_JOINTS
         full = width + way_width + N_JOINTS * n_proposals
         last = nn.Linear(hidden, N_JOINTS + 1 + n_proposals)
         with torch.no_grad():
@@ -529,31 +496,23 @@ class BeliefNetwork(nn.Module):
         proposals = [arm.joint_step(sent, waypoint - sent.position, facing)]
         joints, velocity = self._moving(memory, state)
         ways = []
-        whole = [proposals[0].detach() + set_point - joints]
         ahead_s = self.cell.period_s + self.cell.lead_s
         for over, faced in self._postures(ahead.detach(), normal.detach()):
-            for turns, time_s, within in self._ways_to(joints, over, faced):
-                gone = arm.along_way(turns, velocity[:, :-1], ahead_s)
-                step = gone + (joints - set_point)[:, :-1]
-                proposals.append(F.pad(step, (0, 1)))
-                whole.append(F.pad(turns, (0, 1)))
-                ways += [torch.asinh(turns / scale), time_s, within]
-                ways.append(torch.asinh(step / scale))
+            turns, time_s, within = arm.way_to_posture(joints, over, faced)
+            gone = arm.along_way(turns, velocity[:, :-1], ahead_s)
+            step = gone + (joints - set_point)[:, :-1]
+            proposals.append(F.pad(step, (0, 1)))
+            ways += [torch.asinh(turns / scale), time_s, within]
+            ways.append(torch.asinh(step / scale))
         if self._sees_slopes:
             turn = scale * torch.sinh(guided[:, 9:].clamp(-bound, bound))
             proposals = [proposal + F.pad(turn, (N_JOINTS - 1, 0)) for proposal in proposals]
-        for posture in self._fixed_postures():
-            turns = joints.new_tensor(posture) - joints
+        if self.cell.look_out_rad is not None:
+            turns = joints.new_tensor(self.cell.look_out_rad) - joints
             gone = arm.along_way(turns, velocity, ahead_s, together=False)
             step = gone + joints - set_point
             proposals.append(step)
-            whole.append(turns)
             ways += [torch.asinh(turns / scale), torch.asinh(step / scale)]
-        meets = None
-        if self.shape.obstacles:
-            meets = self._meets(sightings, joints, torch.stack(whole, dim=1))
-            clear = torch.log1p(-SUREST * meets).sum(dim=2)
-            ways += [meets.flatten(1), clear]
         said = [torch.asinh(p / scale) for p in proposals]
         out = self.head(torch.cat([inputs, *ways, *said], dim=1))
         correction, is_corrected, weights = (
@@ -564,8 +523,6 @@ class BeliefNetwork(nn.Module):
         )
         if self._sees_slopes:
             weights = SURE * weights
-        if meets is not None:
-            weights = weights + F.softplus(self.caution) * clear
         # Weights and gate can become nearly whole: near the goal one proposal is right as it is.
         mean = (weights.softmax(dim=1)[:, :, None] * torch.stack(proposals, dim=1)).sum(dim=1)
         total = torch.asinh(mean / scale) + torch.sigmoid(is_corrected) * correction
@@ -582,7 +539,7 @@ class BeliefNetwork(nn.Module):
             Place (B, 3) m and unit normal (B, 3) of each.
         """
         tool = self.cell.tool_length_m
-        places = [(goal + (height + tool) * normal, normal) for height in self._heights_m]
+        places = [(goal + (height + tool) * normal, normal) for height in HEIGHTS_M]
         if self._sees_slopes:
             standoff = self.belief.standoff.float()
             target = goal - standoff * normal
@@ -590,60 +547,6 @@ class BeliefNetwork(nn.Module):
             for height in LEANING_HEIGHTS_M:
                 places.append((target + (standoff + height + tool) * leaning, leaning))
         return places
-
-    @property
-    def _heights_m(self) -> tuple[float, ...]:
-        """Of the plain postures above the goal that face it."""
-        return HEIGHTS_M + (FURTHER_HEIGHTS_M if self.shape.obstacles else ())
-
-    def _fixed_postures(self) -> list[tuple[float, ...]]:
-        """Postures that the head is shown the way to, wherever the goal is, (7,) rad each."""
-        look_out = self.cell.look_out_rad
-        upright = [(0.0,) * N_JOINTS] if self.shape.obstacles else []
-        return upright if look_out is None else [look_out, *upright]
-
-    def _ways_to(
-        self, joints: Tensor, flange: Tensor, normal: Tensor
-    ) -> list[tuple[Tensor, Tensor, Tensor]]:
-        """The ways to plain postures that the head is shown, as `arm.ways_to_postures` has them."""
-        if self.shape.obstacles:
-            return arm.ways_to_postures(joints, flange, normal)
-        return [arm.way_to_posture(joints, flange, normal)]
-
-    @torch.no_grad()
-    def _meets(self, sightings: Mapping[str, Tensor], joints: Tensor, ways: Tensor) -> Tensor:
-        """How likely the arm meets what the eyes say stands around.
-
-        Args:
-            sightings: Camera name to (B, n).
-            joints: Where the ways begin, (B, 7) rad.
-            ways: What is left to turn, (B, k, 7) rad.
-
-        Returns:
-            0 to 1, at each of `SHARES` of the ways, (B, k, s).
-        """
-        n, k = ways.shape[:2]
-        shares = ways.new_tensor(SHARES)[:, None]
-        on_way = joints[:, None, None] + shares * ways[:, :, None]
-        points = geometry.along_links(on_way.flatten(0, 2)).view(n, -1, 3)
-        each = [
-            blocked(sightings[name][:, SIGHTING_SIZE:], points, LINK_M)
-            for name in self.shape.obstacles
-        ]
-        return torch.stack(each).amax(dim=0).view(n, k, len(SHARES), -1).amax(dim=3)
-
-    def sighting_size(self, camera: str) -> int:
-        """How many numbers the eye of a camera says."""
-        return SIGHTING_SIZE + (SIZE if camera in self.shape.obstacles else 0)
-
-    def _surroundings_eye(self, camera: str) -> SurroundingsEye | None:
-        """What tells what stands around from a camera's features; None for nothing."""
-        if camera not in self.shape.obstacles:
-            return None
-        cell = self.cell
-        return SurroundingsEye(
-            self.shape.channels, cell.tan[camera], cell.eth_origin, cell.eth_rotation
-        )
 
     @property
     def _sees_slopes(self) -> bool:

@@ -12,7 +12,6 @@ from hvs_suite.cell.robot import JOINT_RANGE_RAD, set_point_after
 from hvs_suite.datasets.features import ACTION_EXECUTED, STATE
 from hvs_suite.policies.belief.geometry import flange_motion
 from hvs_suite.policies.belief.network import N_JOINTS
-from hvs_suite.policies.belief.surroundings import BOX
 from hvs_suite.policies.training.dataset import (
     EPISODE,
     GOAL_NORMAL,
@@ -20,7 +19,6 @@ from hvs_suite.policies.training.dataset import (
     GOAL_UNSEEN,
     GOAL_VELOCITY,
     JOINT_OFFSET,
-    OBSTACLES,
     TARGET_PREFIX,
 )
 
@@ -38,8 +36,6 @@ class Recorded:
         goal_velocity: (..., 3) m/s.
         targets: Camera name to u, v, apparent diameter in image widths and 1 where it can be seen,
             (..., 4).
-        obstacles: What stands around, as upright boxes, (..., n, 7), see
-            `hvs_suite.policies.belief.surroundings.BOX`; None where nothing does.
     """
 
     set_point: Tensor
@@ -47,7 +43,6 @@ class Recorded:
     goal_normal: Tensor
     goal_velocity: Tensor
     targets: Mapping[str, Tensor]
-    obstacles: Tensor | None = None
 
     def at(self, rows: Tensor) -> "Recorded":
         """The truth of some frames.
@@ -61,7 +56,6 @@ class Recorded:
             self.goal_normal[rows],
             self.goal_velocity[rows],
             {name: target[rows] for name, target in self.targets.items()},
-            None if self.obstacles is None else self.obstacles[rows],
         )
 
     def to(self, device: torch.device) -> "Recorded":
@@ -72,7 +66,6 @@ class Recorded:
             self.goal_normal.to(device),
             self.goal_velocity.to(device),
             {name: target.to(device) for name, target in self.targets.items()},
-            None if self.obstacles is None else self.obstacles.to(device),
         )
 
 
@@ -112,9 +105,6 @@ def recorded(columns: Mapping[str, Column], cameras: tuple[str, ...], period_s: 
         if GOAL_VELOCITY in columns
         else torch.zeros_like(goal),
         targets={name: _tensor(columns[TARGET_PREFIX + name]) for name in cameras},
-        obstacles=_tensor(columns[OBSTACLES]).view(len(goal), -1, BOX)
-        if OBSTACLES in columns
-        else None,
     )
 
 

@@ -92,7 +92,6 @@ class Settings(pydantic.BaseModel):
         slopes: See `Shape`.
         slopes_by: See `Shape`.
         offsets: See `Shape`.
-        obstacles: See `Shape`.
     """
 
     model_config = pydantic.ConfigDict(extra="ignore")
@@ -115,7 +114,6 @@ class Settings(pydantic.BaseModel):
     slopes: tuple[Literal["eih", "eth"], ...] = ()
     slopes_by: Literal["contrasts", "colour"] = "contrasts"
     offsets: tuple[Literal["eih", "eth"], ...] = ()
-    obstacles: tuple[Literal["eth"], ...] = ()
 
     @pydantic.model_validator(mode="after")
     def _fit(self) -> "Settings":
@@ -136,7 +134,7 @@ class Settings(pydantic.BaseModel):
                 raise ValueError(f"{key[:80]} must have shape {shape}, not {self._shape(key)}")
         if further := sorted(self.input_features.keys() - wanted.keys()):
             raise ValueError(f"it has no use for {further[0][:80]!r}")
-        if missing := sorted({*self.slopes, *self.offsets, *self.obstacles} - {*cameras}):
+        if missing := sorted({*self.slopes, *self.offsets} - {*cameras}):
             raise ValueError(f"it has no camera {missing[0]!r}")
         if self.cell.period_s != self.control_period_s:
             raise ValueError(
@@ -173,7 +171,6 @@ class Settings(pydantic.BaseModel):
             slopes=self.slopes,
             slopes_by=self.slopes_by,
             offsets=self.offsets,
-            obstacles=self.obstacles,
         )
 
     def network(self) -> BeliefNetwork:

@@ -11,6 +11,7 @@ from torch import Tensor
 from hvs_suite.datasets.features import IMAGES
 from hvs_suite.policies.belief.acting import act
 from hvs_suite.policies.belief.cell_model import cell_model
+from hvs_suite.policies.belief.eye import SIGHTING_SIZE
 from hvs_suite.policies.belief.lessons import Window, eye_lesson, window_lesson
 from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
 from hvs_suite.policies.belief.prior import take_prior
@@ -127,7 +128,7 @@ class HvsPolicy(PreTrainedPolicy):
         )
         windows = {}
         for name, each in seen.items():
-            windows[name] = each.sighting.new_zeros(n, length, each.sighting.shape[1])
+            windows[name] = each.sighting.new_zeros(n, length, SIGHTING_SIZE)
             windows[name][counts] = each.sighting.detach()
         window = Window(
             memory=network.start(n),

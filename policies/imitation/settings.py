@@ -20,7 +20,7 @@ from hvs_suite.policies.checkpoints.loading import load_network, weights_digest
 from hvs_suite.policies.imitation.dagger import TEACHERS, TeacherName
 from hvs_suite.policies.imitation.frame_cache import fingerprint
 from hvs_suite.policies.trained_for import trained_for
-from hvs_suite.policies.training.dataset import OBSTACLES, Manifest
+from hvs_suite.policies.training.dataset import Manifest
 from hvs_suite.registry import find
 from hvs_suite.tasks.shared.spec import PRESETS
 
@@ -56,7 +56,6 @@ class Settings:
             the rest. With 1 there is nothing but eyes, for another run to begin with.
         slopes: Cameras whose eyes tell the slope of the surface.
         offsets: Cameras whose pose is not exact: how they are shifted and turned is found out.
-        obstacles: Cameras whose eyes tell what stands around.
     """
 
     seed: int = 0
@@ -78,7 +77,6 @@ class Settings:
     eye_share: float = 0.5
     slopes: tuple[str, ...] = ()
     offsets: tuple[str, ...] = ()
-    obstacles: tuple[str, ...] = ()
 
     def reads(self, name: str) -> bool:
         """Whether the policy is given an input."""
@@ -96,13 +94,10 @@ class Settings:
         if unknown := sorted({*(self.inputs or ())} - {*INPUTS}):
             raise OptionError(f"unknown input {unknown[0]!r}; choose from {', '.join(INPUTS)}")
         cameras = [name for name in manifest.cameras if self.reads(name)]
-        told = {*self.slopes, *self.offsets, *self.obstacles, *self.kept_eyes}
-        if unknown := sorted(told - {*cameras}):
+        if unknown := sorted({*self.slopes, *self.offsets, *self.kept_eyes} - {*cameras}):
             raise OptionError(f"unknown camera {unknown[0]!r}; choose from {', '.join(cameras)}")
         if {*self.kept_eyes} == {*cameras}:
             raise OptionError("kept_eyes must leave a camera whose eye learns")
-        if self.obstacles and OBSTACLES not in manifest.features:
-            raise OptionError(f"{manifest.root} has no {OBSTACLES}; leave --obstacles out")
         for name in ("batch_size", "dagger_frames", "windows", "window_steps"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}")
@@ -192,7 +187,6 @@ def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":
         slopes=settings.slopes,
         slopes_by="colour",
         offsets=settings.offsets,
-        obstacles=settings.obstacles,
         **trained_for(task).model_dump(),
     )
     # torch initialises weights from its global generator; leave that as it was found.

@@ -31,8 +31,7 @@ GOAL_NORMAL = "privileged.goal_normal"
 GOAL_VELOCITY = "privileged.goal_velocity"
 JOINT_OFFSET = "privileged.joint_offset"
 GOAL_UNSEEN = "privileged.goal_unseen"
-OBSTACLES = "privileged.obstacles"
-FURTHER_KEYS = (GOAL_VELOCITY, JOINT_OFFSET, GOAL_UNSEEN, OBSTACLES)
+FURTHER_KEYS = (GOAL_VELOCITY, JOINT_OFFSET, GOAL_UNSEEN)
 """Columns that only some tasks have: elsewhere goals stand still, encoders are right, and goals are
 where the pictures show them."""
 TARGET_PREFIX = "privileged.target_"

@@ -31,10 +31,6 @@ HEIGHT_M = 0.50
 MAX_OBSTACLES = 6
 """How many there are."""
 CARRIAGE, LANE, OVERHANG = "carriage", "lane", "overhang"
-OBSTACLES = "obstacles"
-_BOX = ("x", "y", "z", "half_x", "half_y", "half_z", "yaw")
-MAX_SOLIDS = 7
-"""Of which obstacles are made that stand there at once."""
 LANE_M = 0.30
 """How far the carriage moves (m)."""
 _LANE_WIDTH_M = 0.09
@@ -65,14 +61,6 @@ class ObstaclesSpec(Spec):
     moves: bool = scene(False)
     moves_at_s: tuple[float, float] = scene((0.3, 1.5))
     speed_m_s: tuple[float, float] = scene((0.10, 0.20))
-
-    @property
-    def privileged(self) -> dict[str, tuple[str, ...]]:
-        """As of every task; where obstacles may stand, these as upright boxes, too."""
-        if not self.n_obstacles[1]:
-            return super().privileged
-        boxes = tuple(f"box_{i}_{name}" for i in range(MAX_SOLIDS) for name in _BOX)
-        return {**super().privileged, OBSTACLES: boxes}
 
     def __post_init__(self) -> None:
         """Refuse values that make no sense, with a sentence.
@@ -246,16 +234,6 @@ class Obstacles:
             rests = each is self._carriage and self._way_m >= LANE_M
             solids += self.solids(each, self._way_m if rests else 0.0)
         return tuple(solids)
-
-    def boxes(self) -> FloatArray:
-        """What all fill, as upright boxes around `present`, (7 x `MAX_SOLIDS`,).
-
-        Centre (m), half the sides (m) and turn (rad) of each; zeros for those that are not there.
-        """
-        boxes = np.zeros((MAX_SOLIDS, len(_BOX)))
-        for row, solid in zip(boxes, self.present(), strict=False):
-            row[:] = *solid.centre, *solid.half, solid.yaw
-        return boxes.ravel()
 
     def solids(self, placed: Placed, way_m: float = 0.0) -> "list[Solid]":
         """What an obstacle fills; the carriage, all from where it has come to its lane's end.
