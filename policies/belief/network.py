@@ -5,7 +5,7 @@ task is (where targets lie, how large they are, how far off the tool stays, what
 learns from demonstrations.
 
 The head thinks in the goal's frame first: a small network says to which point by the goal the tip
-should go next, damped least squares turn that into a joint step. The ways to plain postures
+should go next, damped least squares turn that into a joint step. The ways to two plain postures
 over the goal, and to one from which the cameras see more, are put beside it. A second network
 weighs them and corrects their mean, on a logarithmic scale on which a micrometre and a metre both
 teach something.
@@ -20,7 +20,6 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
-from hvs_suite.cell.plain_postures import CHOSEN_ABOVE_M
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S, LAG_S
 from hvs_suite.policies.belief import arm, geometry
 from hvs_suite.policies.belief.belief import (
@@ -128,8 +127,6 @@ class Shape:
             (`hvs_suite.policies.belief.colour_slope`).
         offsets: Cameras whose pose is not exact, and of which the belief finds out how they are
             shifted and turned.
-        elbow_aside: Whether the plain postures that the head is shown may have the elbow to a side,
-            as those of `hvs_suite.cell.plain_postures`. Older weights know it straight above alone.
     """
 
     cameras: Mapping[str, tuple[int, int]]
@@ -146,7 +143,6 @@ class Shape:
     slopes: tuple[str, ...] = ()
     slopes_by: Literal["contrasts", "colour"] = "contrasts"
     offsets: tuple[str, ...] = ()
-    elbow_aside: bool = True
 
 
 MEMORY_SIZE = BELIEF_SIZE + 2 * N_JOINTS + 2 + RECENT_SIZE
@@ -501,7 +497,8 @@ class BeliefNetwork(nn.Module):
         joints, velocity = self._moving(memory, state)
         ways = []
         ahead_s = self.cell.period_s + self.cell.lead_s
-        for turns, time_s, within in self._plain_ways(joints, ahead.detach(), normal.detach()):
+        for over, faced in self._postures(ahead.detach(), normal.detach()):
+            turns, time_s, within = arm.way_to_posture(joints, over, faced)
             gone = arm.along_way(turns, velocity[:, :-1], ahead_s)
             step = gone + (joints - set_point)[:, :-1]
             proposals.append(F.pad(step, (0, 1)))
@@ -531,35 +528,25 @@ class BeliefNetwork(nn.Module):
         total = torch.asinh(mean / scale) + torch.sigmoid(is_corrected) * correction
         return Decision(total, torch.stack(said, dim=1), weights)
 
-    def _plain_ways(
-        self, joints: Tensor, goal: Tensor, normal: Tensor
-    ) -> list[tuple[Tensor, Tensor, Tensor]]:
-        """The ways to the plain postures that the head is shown.
+    def _postures(self, goal: Tensor, normal: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Where the plain postures that the head is shown have the flange, and what they face.
 
         Args:
-            joints: From where, (B, 7) rad.
             goal: Of the tip, (B, 3) m.
             normal: Of the surface, (B, 3).
 
         Returns:
-            Of each what `arm.way_to_posture` does.
+            Place (B, 3) m and unit normal (B, 3) of each.
         """
-        tool, standoff = self.cell.tool_length_m, self.belief.standoff.float()
-        target = goal - standoff * normal
-        over = [goal + (height + tool) * normal for height in HEIGHTS_M]
-        facings = [(normal, over)]
+        tool = self.cell.tool_length_m
+        places = [(goal + (height + tool) * normal, normal) for height in HEIGHTS_M]
         if self._sees_slopes:
+            standoff = self.belief.standoff.float()
+            target = goal - standoff * normal
             leaning = _leaning(normal, ARRIVES_LEANING * F.normalize(target[:, :2], dim=1))
-            over = [target + (standoff + height + tool) * leaning for height in LEANING_HEIGHTS_M]
-            facings.append((leaning, over))
-        ways = []
-        for facing, over in facings:
-            if self.shape.elbow_aside:
-                chosen = target + (CHOSEN_ABOVE_M + tool) * facing
-                ways += arm.ways_to_posture(joints, torch.stack(over, dim=1), facing, chosen)
-            else:
-                ways += [arm.way_to_posture(joints, place, facing) for place in over]
-        return ways
+            for height in LEANING_HEIGHTS_M:
+                places.append((target + (standoff + height + tool) * leaning, leaning))
+        return places
 
     @property
     def _sees_slopes(self) -> bool:

@@ -92,7 +92,6 @@ class Settings(pydantic.BaseModel):
         slopes: See `Shape`.
         slopes_by: See `Shape`.
         offsets: See `Shape`.
-        elbow_aside: See `Shape`.
     """
 
     model_config = pydantic.ConfigDict(extra="ignore")
@@ -115,7 +114,6 @@ class Settings(pydantic.BaseModel):
     slopes: tuple[Literal["eih", "eth"], ...] = ()
     slopes_by: Literal["contrasts", "colour"] = "contrasts"
     offsets: tuple[Literal["eih", "eth"], ...] = ()
-    elbow_aside: Annotated[bool, pydantic.Field(strict=True)] = False
 
     @pydantic.model_validator(mode="after")
     def _fit(self) -> "Settings":
@@ -173,7 +171,6 @@ class Settings(pydantic.BaseModel):
             slopes=self.slopes,
             slopes_by=self.slopes_by,
             offsets=self.offsets,
-            elbow_aside=self.elbow_aside,
         )
 
     def network(self) -> BeliefNetwork:

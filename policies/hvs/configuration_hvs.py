@@ -43,7 +43,6 @@ class HvsConfig(PreTrainedConfig):
         slopes: Cameras whose eyes tell slopes, see `Shape`.
         slopes_by: See `Shape`; ``hvs pretrain`` makes it ``colour``.
         offsets: Cameras whose pose is not exact, see `Shape`.
-        elbow_aside: See `Shape`; a new policy takes it of its dataset.
         family: Family of the tasks that it was trained for.
         control_period_s: Length of their control step (s).
         options: Options of the task that it was trained with, where they differ from the named one;
@@ -75,7 +74,6 @@ class HvsConfig(PreTrainedConfig):
     slopes: tuple[str, ...] = ()
     slopes_by: str = "contrasts"
     offsets: tuple[str, ...] = ()
-    elbow_aside: bool = False
     family: str = FAMILY
     control_period_s: float = CONTROL_PERIOD_S
     options: dict[str, Any] = field(default_factory=dict)

@@ -194,7 +194,6 @@ def _take_over(config: HvsConfig, manifest: Manifest) -> None:
     for name, value in trained_for(spec).model_dump().items():
         setattr(config, name, value)
     config.cell = as_numbers(cell_model(spec))
-    config.elbow_aside = True
 
 
 def save_checkpoint(policy: HvsPolicy, folder: Path) -> None:

@@ -187,7 +187,6 @@ def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":
         slopes=settings.slopes,
         slopes_by="colour",
         offsets=settings.offsets,
-        elbow_aside=True,
         **trained_for(task).model_dump(),
     )
     # torch initialises weights from its global generator; leave that as it was found.
