@@ -37,6 +37,7 @@ from hvs_suite.policies.belief.belief import (
 )
 from hvs_suite.policies.belief.colour_slope import ColourSlopeEye
 from hvs_suite.policies.belief.eye import LOG_DIAMETER, UV, VISIBLE, Eye, Seen
+from hvs_suite.policies.belief.foresight import Foresight
 from hvs_suite.policies.belief.geometry import FlangeMotion
 from hvs_suite.policies.belief.residual import RESIDUAL_SIZE, SHIFT, Residual, goal_axes
 from hvs_suite.policies.belief.slope import SlopeEye
@@ -127,6 +128,9 @@ class Shape:
             (`hvs_suite.policies.belief.colour_slope`).
         offsets: Cameras whose pose is not exact, and of which the belief finds out how they are
             shifted and turned.
+        foresight: Control steps of which it remembers where the target was, to say where it will be
+            (`hvs_suite.policies.belief.foresight`); with 0, it takes the believed acceleration to
+            last.
     """
 
     cameras: Mapping[str, tuple[int, int]]
@@ -143,6 +147,7 @@ class Shape:
     slopes: tuple[str, ...] = ()
     slopes_by: Literal["contrasts", "colour"] = "contrasts"
     offsets: tuple[str, ...] = ()
+    foresight: int = 0
 
 
 MEMORY_SIZE = BELIEF_SIZE + 2 * N_JOINTS + 2 + RECENT_SIZE
@@ -265,6 +270,12 @@ class BeliefNetwork(nn.Module):
                 shape.residual_reach_m,
                 cell.period_s,
             )
+        self.foresight: Foresight | None = None
+        begin = MEMORY_SIZE if self.residual is None else FELT.stop
+        self._past = slice(begin, begin)
+        if shape.foresight:
+            self.foresight = Foresight(shape.foresight, cell.period_s)
+            self._past = slice(begin, begin + self.foresight.size)
 
     # --- the cell ---
 
@@ -312,11 +323,12 @@ class BeliefNetwork(nn.Module):
 
     def start(self, n: int) -> Tensor:
         """The memory at the beginning of an episode, (n, k) float64."""
-        size = MEMORY_SIZE if self.residual is None else FELT.stop
-        memory = torch.zeros(n, size, dtype=torch.float64)
+        memory = torch.zeros(n, self._past.stop, dtype=torch.float64)
         believed = self.belief.start(n)
         memory[:, :BELIEF_SIZE] = believed[:, :BELIEF_SIZE]
         memory[:, RECENT] = 1.0
+        if self.foresight is not None:
+            memory[:, self._past] = self.foresight.start(n)
         # Offsets stand at the end, because not every network has them.
         return torch.cat([memory, believed[:, BELIEF_SIZE:]], dim=1)
 
@@ -343,9 +355,12 @@ class BeliefNetwork(nn.Module):
         if rays is None or not self.shape.reads_positions:
             views = self.views(geometry.flange_motion(q.double()))
             rays = self.belief.rays(sightings, views)
-        offsets = memory.shape[1] - (self.belief.size - BELIEF_SIZE)
-        before = torch.cat([memory[:, :BELIEF_SIZE], memory[:, offsets:]], dim=1)
+        past = memory[:, self._past]
+        before = torch.cat([memory[:, :BELIEF_SIZE], memory[:, self._past.stop :]], dim=1)
         believed, forget = self.belief(before, rays)
+        if self.foresight is not None:
+            place, variance = _place_of(before)
+            past = self.foresight.remember(past, place, variance, forget)
         begun = memory[:, BEGUN] > 0
         set_point, trailing = (
             torch.where(begun, memory[:, part], q.double()) for part in (SET_POINT, TRAILING)
@@ -365,7 +380,8 @@ class BeliefNetwork(nn.Module):
             memory[:, STEPS] + 1.0,
             unseen,
             away,
-            memory[:, MEMORY_SIZE:offsets],
+            memory[:, MEMORY_SIZE : self._past.start],
+            past,
             believed[:, BELIEF_SIZE:],
         ]
         return torch.cat(parts, dim=1)
@@ -460,7 +476,6 @@ class BeliefNetwork(nn.Module):
         place = self._place(memory, state[:, :N_JOINTS])
         here, sent, goal, normal = place.here, place.sent, place.goal, place.normal
         set_point = memory[:, SET_POINT].float()
-        speed, bend = memory[:, VELOCITY].float(), memory[:, ACCELERATION].float()
         inputs = self._head_inputs(memory, sightings, state, felt, place)
         # The point by the goal, its sideways axes those of the tool.
         guided = self.guide(inputs)
@@ -469,7 +484,7 @@ class BeliefNetwork(nn.Module):
         side = sent.rotation[:, :, :2]
         side = side - normal[:, :, None] * (normal[:, None] @ side)
         lead = self.lead_s * (1.0 + 0.5 * torch.tanh(guided[:, 3:4]))
-        ahead = goal + lead * speed + 0.5 * lead**2 * bend
+        ahead = goal + self._moved(memory, lead)
         waypoint = ahead + (side @ by[:, :2, None])[:, :, 0] + by[:, 2:] * normal
         # The arm trails its set point. What is sent farther, so that it arrives, is linear in where
         # it stands: exactly what a network on a logarithmic scale says only roughly.
@@ -597,6 +612,14 @@ class BeliefNetwork(nn.Module):
         )
         return _Place(here, sent, *self._goal(memory))
 
+    def _moved(self, memory: Tensor, lead: Tensor) -> Tensor:
+        """How far the target will have moved in a time (B, 1) s, (B, 3) m."""
+        if self.foresight is None:
+            speed, bend = memory[:, VELOCITY].float(), memory[:, ACCELERATION].float()
+            return lead * speed + 0.5 * lead**2 * bend
+        place, variance = _place_of(memory)
+        return self.foresight.ahead(memory[:, self._past], place, variance, lead).float()
+
     def _head_inputs(
         self,
         memory: Tensor,
@@ -702,6 +725,12 @@ class BeliefNetwork(nn.Module):
 def _with_felt(memory: Tensor, part: Tensor) -> Tensor:
     """A memory (B, k) with what the residual remembers replaced."""
     return torch.cat([memory[:, :MEMORY_SIZE], part, memory[:, FELT.stop :]], dim=1)
+
+
+def _place_of(believed: Tensor) -> tuple[Tensor, Tensor]:
+    """Where a belief (B, k) has the target, (B, 3) m, and the variance of each coordinate."""
+    P = believed[:, COVARIANCE].view(-1, N_MOTION, N_MOTION)
+    return believed[:, PLACE], torch.diagonal(P, dim1=1, dim2=2)[:, PLACE]
 
 
 def _leaning(normal: Tensor, lean: Tensor) -> Tensor:

@@ -103,12 +103,19 @@ def take_prior(network: BeliefNetwork, columns: Mapping[str, npt.NDArray[np.gene
     """Give a network what demonstrations say beforehand.
 
     Args:
-        network: Gets it: the prior of its belief, and how low goals lie.
+        network: Gets it: the prior of its belief, how low goals lie, and how targets move, if it
+            has foresight.
         columns: As in `fit_prior`.
     """
     views = network.views(flange_motion(_double(columns[STATE])[:, :N_JOINTS]))
     prior = fit_prior(columns, views, network.cell.period_s)
     network.set_prior(prior, float(np.asarray(columns[GOAL_POSITION])[:, 2].min()))
+    if network.foresight is not None:
+        goal, normal = (_double(part) for part in shown_goals(columns))
+        episode = torch.from_numpy(np.asarray(columns[EPISODE], np.int64))
+        network.foresight.learn(
+            goal - prior.standoff_m * normal, _double(columns[GOAL_VELOCITY]), episode
+        )
 
 
 def _standoff(goal: Tensor, normal: Tensor, target: Tensor, view: View) -> float:

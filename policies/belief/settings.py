@@ -18,6 +18,7 @@ CAMERAS = ("eih", "eth")
 STATE_SIZE = 2 * N_JOINTS
 WRENCH_SIZE = 6
 _MOST_SIZE = 4096
+_MOST_PAST = 100
 _ORTHONORMAL = 1e-6
 
 Size = Annotated[int, pydantic.Field(strict=True, ge=1, le=_MOST_SIZE)]
@@ -92,6 +93,7 @@ class Settings(pydantic.BaseModel):
         slopes: See `Shape`.
         slopes_by: See `Shape`.
         offsets: See `Shape`.
+        foresight: See `Shape`.
     """
 
     model_config = pydantic.ConfigDict(extra="ignore")
@@ -114,6 +116,7 @@ class Settings(pydantic.BaseModel):
     slopes: tuple[Literal["eih", "eth"], ...] = ()
     slopes_by: Literal["contrasts", "colour"] = "contrasts"
     offsets: tuple[Literal["eih", "eth"], ...] = ()
+    foresight: Annotated[int, pydantic.Field(strict=True, ge=0, le=_MOST_PAST)] = 0
 
     @pydantic.model_validator(mode="after")
     def _fit(self) -> "Settings":
@@ -171,6 +174,7 @@ class Settings(pydantic.BaseModel):
             slopes=self.slopes,
             slopes_by=self.slopes_by,
             offsets=self.offsets,
+            foresight=self.foresight,
         )
 
     def network(self) -> BeliefNetwork:

@@ -43,6 +43,8 @@ class HvsConfig(PreTrainedConfig):
         slopes: Cameras whose eyes tell slopes, see `Shape`.
         slopes_by: See `Shape`; ``hvs pretrain`` makes it ``colour``.
         offsets: Cameras whose pose is not exact, see `Shape`.
+        foresight: Control steps of which it remembers where the target was, see `Shape`; a new
+            policy, where the targets of its dataset move.
         family: Family of the tasks that it was trained for.
         control_period_s: Length of their control step (s).
         options: Options of the task that it was trained with, where they differ from the named one;
@@ -74,6 +76,7 @@ class HvsConfig(PreTrainedConfig):
     slopes: tuple[str, ...] = ()
     slopes_by: str = "contrasts"
     offsets: tuple[str, ...] = ()
+    foresight: int = 0
     family: str = FAMILY
     control_period_s: float = CONTROL_PERIOD_S
     options: dict[str, Any] = field(default_factory=dict)

@@ -12,6 +12,7 @@ from hvs_suite.datasets.features import IMAGES
 from hvs_suite.policies.belief.acting import act
 from hvs_suite.policies.belief.cell_model import cell_model
 from hvs_suite.policies.belief.eye import SIGHTING_SIZE
+from hvs_suite.policies.belief.foresight import PAST_STEPS
 from hvs_suite.policies.belief.lessons import Window, eye_lesson, window_lesson
 from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
 from hvs_suite.policies.belief.prior import take_prior
@@ -194,6 +195,7 @@ def _take_over(config: HvsConfig, manifest: Manifest) -> None:
     for name, value in trained_for(spec).model_dump().items():
         setattr(config, name, value)
     config.cell = as_numbers(cell_model(spec))
+    config.foresight = PAST_STEPS if manifest.has_moving_targets else 0
 
 
 def save_checkpoint(policy: HvsPolicy, folder: Path) -> None:

@@ -15,6 +15,7 @@ from hvs_suite.errors import DatasetError, OptionError, PolicyError
 from hvs_suite.policies.belief.cell_model import cell_model
 from hvs_suite.policies.belief.colour_slope import ColourSlopeEye
 from hvs_suite.policies.belief.eye import Eye
+from hvs_suite.policies.belief.foresight import PAST_STEPS
 from hvs_suite.policies.belief.settings import as_numbers, further_keys
 from hvs_suite.policies.checkpoints.loading import load_network, weights_digest
 from hvs_suite.policies.imitation.dagger import TEACHERS, TeacherName
@@ -187,6 +188,7 @@ def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":
         slopes=settings.slopes,
         slopes_by="colour",
         offsets=settings.offsets,
+        foresight=PAST_STEPS if manifest.has_moving_targets else 0,
         **trained_for(task).model_dump(),
     )
     # torch initialises weights from its global generator; leave that as it was found.

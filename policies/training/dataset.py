@@ -74,6 +74,11 @@ class Manifest:
         }
 
     @property
+    def has_moving_targets(self) -> bool:
+        """Whether its targets move within an episode."""
+        return GOAL_VELOCITY in self.features
+
+    @property
     def trained_keys(self) -> list[str]:
         """The features that training reads: all observations, actions, targets, goal."""
         wanted = {STATE, ACTION, ACTION_EXECUTED, GOAL_POSITION, GOAL_NORMAL}

@@ -28,8 +28,8 @@ from hvs_suite.policies.training.dataset import read_columns, read_manifest
 from hvs_suite.registry import TASKS
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "align-thesis"
-# Cameras and joints alone; a goal to choose; a wrench and a tool.
-PLAYED = ("align-easy", "clutter-choice", "insert-wide")
+# Cameras and joints alone; a goal to choose; a target that moves; a wrench and a tool.
+PLAYED = ("align-easy", "clutter-choice", "track-line", "insert-wide")
 WINDOW = 5
 ENDS = (1, 11, 22)
 """Of the windows of the batch: the second frame of an episode, and two that show the target."""
@@ -50,6 +50,7 @@ def new_policy(task: str):
         cell=as_numbers(cell_model(spec)),
         channels=8,
         hidden=32,
+        foresight=3 if spec.family == "track" else 0,
         device="cpu",
         **trained_for(spec).model_dump(),
     )
