@@ -6,11 +6,14 @@ is off by more than the tolerance. No arm and no pictures: what is left is the m
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
 import hvs_suite
+from hvs_suite.policies.belief.foresight import Foresight
 from hvs_suite.policies.servo.motion_estimate import MotionEstimate
 from hvs_suite.policies.servo.target_estimate import Sighting
 
@@ -19,6 +22,9 @@ Predict = Callable[[FloatArray], FloatArray]
 """From places seen, (n, 2) m, to those that the last `COUNTED` of them foretell, (m, 2) m."""
 
 SCENES = 200
+TAUGHT_BY = 500
+"""Motions of ``train`` that say how targets move."""
+REMEMBERED = (10, 20, 30)
 PERIOD_S, AHEAD_S = 0.1, 0.2
 SEEN, COUNTED, TOLERANCE_M = 69, 20, 0.001
 """Steps with a sighting: the first second goes by on the way to the target."""
@@ -62,10 +68,52 @@ def gaussian_process(variance_m2: float, noise_m: float) -> Predict:
     return predict
 
 
+def remembering(foresight: Foresight, jerk: float, noise_m: float) -> Predict:
+    """The policy's foresight, from places that the filter with constant acceleration gives."""
+    variance = torch.tensor([[noise_m**2, noise_m**2, 0.0]], dtype=torch.float64)
+    lead, nothing = torch.full((1, 1), AHEAD_S), torch.zeros(1, 1)
+
+    def predict(seen: FloatArray) -> FloatArray:
+        estimate = MotionEstimate(0.0, SPEED_M_S, ACCELERATION_M_S2, 0.0, jerk)
+        past, foretold = foresight.start(1), []
+        for place in seen:
+            estimate.pass_time(PERIOD_S)
+            estimate.see_eih(Sighting(place, noise_m**2 * np.eye(2), 1.0, True, 0.05, 40.0))
+            now = torch.from_numpy(np.append(estimate.place(0.0)[0], 0.0))[None]
+            moved = foresight.ahead(past, now, variance, lead)
+            foretold.append((now + moved)[0, :2].numpy())
+            past = foresight.remember(past, now, variance, nothing)
+        return np.array(foretold[-COUNTED:])
+
+    return predict
+
+
+def taught(n_past: int) -> Foresight:
+    """Foresight that has learned from motions of ``train``."""
+    motions = drawn("train", TAUGHT_BY)
+    times = PERIOD_S * np.arange(SEEN + 11)
+    moments = [np.stack([m.place(times + late) for m in motions]) for late in (0.0, 1e-3)]
+    place = np.pad(moments[0], ((0, 0), (0, 0), (0, 1)))
+    velocity = np.pad((moments[1] - moments[0]) / 1e-3, ((0, 0), (0, 0), (0, 1)))
+    foresight = Foresight(n_past, PERIOD_S)
+    foresight.learn(
+        torch.from_numpy(place).flatten(0, 1),
+        torch.from_numpy(velocity).flatten(0, 1),
+        torch.arange(TAUGHT_BY).repeat_interleave(len(times)),
+    )
+    return foresight
+
+
+def drawn(split: str, n: int) -> list[Any]:
+    """The first motions of a split."""
+    with hvs_suite.load("track-hard", split=split, observations="state") as env:
+        return [env.task.source.draw(index).motion for index in range(n)]
+
+
 def main() -> None:
     """Print a table."""
-    with hvs_suite.load("track-hard", split="dev", observations="state") as env:
-        motions = [env.task.source.draw(index).motion for index in range(SCENES)]
+    motions = drawn("dev", SCENES)
+    foresights = {n_past: taught(n_past) for n_past in REMEMBERED}
     variance = float(np.mean([(motion.amplitude**2).sum(axis=0) / 2.0 for motion in motions]))
     random = np.random.default_rng(0)
     pace = ACCELERATION_M_S2 / SPEED_M_S
@@ -75,6 +123,9 @@ def main() -> None:
             "oscillation of one pace": kalman(pace, 0.25 * pace * ACCELERATION_M_S2, noise),
             "Gaussian process": gaussian_process(variance, noise),
         }
+        for n_past, foresight in foresights.items():
+            jerk = pace * ACCELERATION_M_S2
+            predictors[f"{n_past} places remembered"] = remembering(foresight, jerk, noise)
         worst: dict[str, list[float]] = {name: [] for name in predictors}
         for motion in motions:
             times = 1.0 + PERIOD_S * np.arange(SEEN)
