@@ -1,10 +1,11 @@
 """Foresight: where a target that moves will be soon, from where it has been.
 
-An action acts a step or two late, so it has to go to where the target will be by then. Place,
-velocity and acceleration carried on are off by a millimetre there, because a motion that stays
-within bounds turns back. How such motions go on, demonstrations show: the best linear prediction
-has the second moments of their places for a covariance, and the belief's variances for the noise
-of what was seen (Gaussian process regression; Rasmussen and Williams, 2006, equations 2.23, 2.24).
+An action acts a step or two late, so it has to go to where the target will be by then. On
+``track-hard``, place, velocity and acceleration carried on are off by a millimetre there, because a
+motion that stays within bounds turns back. How such motions go on, demonstrations show: the best
+linear prediction has the second moments of their places for a covariance, and the belief's
+variances for the noise of what was seen (Gaussian process regression; Rasmussen and Williams, 2006,
+equation 2.25).
 """
 
 import torch
@@ -60,7 +61,7 @@ class Foresight(nn.Module):
         fastest = velocity.norm(dim=1).max() * self._period_s
         begins = (episode.diff() != 0) | (place.diff(dim=0).norm(dim=1) > SUDDEN * fastest)
         followed = nn.functional.pad(begins.cumsum(dim=0), (1, 0))
-        now = torch.arange(n, len(place) - N_AHEAD)
+        now = torch.arange(n, max(n, len(place) - N_AHEAD))
         now = now[followed[now - n] == followed[now + N_AHEAD]]
         steps = [*range(-1, -n - 1, -1), *range(1, N_AHEAD + 1)]
         moved = torch.stack([place[now + step] - place[now] for step in steps], dim=2)

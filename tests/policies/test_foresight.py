@@ -18,7 +18,6 @@ PERIOD_S = 0.1
 STEPS = 60
 AHEAD_S = 0.2
 SURE_M2 = (3e-5) ** 2
-NOTHING_FORGOTTEN = torch.full((1, 1), 1e-7, dtype=torch.float64)
 
 
 def ways(split: str, n: int) -> tuple[Tensor, Tensor]:
@@ -40,12 +39,12 @@ def taught(places: Tensor, velocities: Tensor, n_past: int = PAST_STEPS) -> Fore
     return foresight
 
 
-def followed(foresight: Foresight, places: Tensor, forget: Tensor = NOTHING_FORGOTTEN) -> Tensor:
-    """What is remembered at the last of places (B, T, 3) that were seen."""
-    past = foresight.start(len(places))
-    sure = torch.full_like(places[:, 0], SURE_M2)
+def followed(foresight: Foresight, places: Tensor, past: Tensor | None = None) -> Tensor:
+    """What is remembered at the last of places (B, T, 3) that were seen, and before them `past`."""
+    past = foresight.start(len(places)) if past is None else past
+    sure, a_little = torch.full_like(places[:, 0], SURE_M2), torch.full_like(places[:, 0, :1], 1e-7)
     for place in places[:, :-1].unbind(dim=1):
-        past = foresight.remember(past, place, sure, forget.expand(len(places), 1))
+        past = foresight.remember(past, place, sure, a_little)
     return past
 
 
@@ -98,6 +97,11 @@ def test_a_target_that_never_moved_stays_where_it_is() -> None:
     assert foretold(still, past, places[:, 0]).abs().max() == 0.0
 
 
+def test_of_episodes_that_are_too_short_nothing_is_learned() -> None:
+    short = torch.rand(1, PAST_STEPS, 3, dtype=torch.float64)
+    assert taught(short, torch.ones_like(short)).moments.abs().max() == 0.0
+
+
 def test_targets_that_come_one_after_the_other_are_not_taken_for_one_that_moves() -> None:
     places, velocities = ways("train", 20)
     one = taught(places, velocities).moments
@@ -117,9 +121,7 @@ def test_what_was_before_the_episode_or_was_forgotten_counts_for_nothing(
     # Another target before it, which was forgotten when this one came.
     sure, all_of_it = torch.full_like(near[:, 0], SURE_M2), torch.ones(10, 1, dtype=torch.float64)
     past = foresight.remember(followed(foresight, far), far[:, -1], sure, all_of_it)
-    for place in near[:, :-1].unbind(dim=1):
-        past = foresight.remember(past, place, sure, NOTHING_FORGOTTEN.expand(10, 1))
-    after = foretold(foresight, past, near[:, -1])
+    after = foretold(foresight, followed(foresight, near, past), near[:, -1])
     np.testing.assert_allclose(after, alone, atol=2e-5)
 
 
