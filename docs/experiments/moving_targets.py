@@ -92,9 +92,11 @@ def taught(n_past: int) -> Foresight:
     """Foresight that has learned from motions of ``train``."""
     motions = drawn("train", TAUGHT_BY)
     times = PERIOD_S * np.arange(SEEN + 11)
-    moments = [np.stack([m.place(times + late) for m in motions]) for late in (0.0, 1e-3)]
-    place = np.pad(moments[0], ((0, 0), (0, 0), (0, 1)))
-    velocity = np.pad((moments[1] - moments[0]) / 1e-3, ((0, 0), (0, 0), (0, 1)))
+    now, later = (np.stack([m.place(times + late) for m in motions]) for late in (0.0, 1e-3))
+    # On one level.
+    place, velocity = (
+        np.pad(part, ((0, 0), (0, 0), (0, 1))) for part in (now, (later - now) / 1e-3)
+    )
     foresight = Foresight(n_past, PERIOD_S)
     foresight.learn(
         torch.from_numpy(place).flatten(0, 1),

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 PAST_STEPS = 20
-"""Remembered by networks whose targets move: two seconds."""
+"""Remembered by networks whose targets move: two seconds, at ten control steps a second."""
 N_AHEAD = 3
 """Control steps that are foreseen; between them it is interpolated."""
 FLOOR_M = 3e-5

@@ -106,7 +106,7 @@ def test_targets_that_come_one_after_the_other_are_not_taken_for_one_that_moves(
     places, velocities = ways("train", 20)
     one = taught(places, velocities).moments
     # The same motions, but half-way somewhere else.
-    elsewhere = torch.where(torch.arange(STEPS)[:, None] < STEPS // 2, 0.0, 0.3)
+    elsewhere = torch.where(torch.arange(STEPS)[:, None] < STEPS // 2, 0.0, 3.0)
     two = taught(places + elsewhere, velocities).moments
     assert two[:2].diagonal(dim1=1, dim2=2).max() < 2.0 * one.max()
 
