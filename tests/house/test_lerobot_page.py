@@ -1,5 +1,6 @@
 """What docs/lerobot-benchmark.md says of the tasks is true, and what it shows works."""
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -9,7 +10,8 @@ import pytest
 from hvs_suite.cli.main import run
 from hvs_suite.registry import TASKS
 
-PAGE = (Path(__file__).parents[2] / "docs" / "lerobot-benchmark.md").read_text("utf-8")
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "lerobot-benchmark.md").read_text("utf-8")
 
 
 def table(first):
@@ -37,6 +39,18 @@ def test_the_table_of_tasks_is_that_of_the_registry():
         cells = (f"`{name}`", words.tolerance, held, spec.time_limit_steps, sides, also or "-")
         rows.append(f"| {' | '.join(map(str, cells))} |")
     assert table("task") == rows
+
+
+def test_the_published_results_are_the_board_s():
+    rows = [[cell.strip() for cell in row[1:-1].split("|")] for row in table("weights and task")]
+    assert {TASKS[row[0].split("/")[1].strip("`")].family for row in rows} == {
+        spec.family for spec in TASKS.values()
+    }
+    for name, _, solved in rows:
+        path = ROOT / "eval" / "results" / f"{name.strip('`')}.json"
+        summary = json.loads(path.read_text("utf-8"))["summary"]
+        assert summary["n_episodes"] == 1000
+        assert solved == f"{summary['n_success']:,}"
 
 
 @pytest.mark.timeout(300)
