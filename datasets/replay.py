@@ -6,7 +6,6 @@ the dataset either: the film ends with it, re-simulated.
 """
 
 import dataclasses
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -112,7 +111,7 @@ def replay(root: Path, episode: int) -> Replay:
         at_end = [env.info["errors"][metric.name] for metric in spec.metrics]
         for camera, shown in pictures.items():
             shown.append(as_rgb(time_step.observation[camera]))
-    errors = np.vstack([recorded.errors, at_end])
+    curves = _Curves(spec, np.vstack([recorded.errors, at_end]))
     head = f"{root.resolve().name}, episode {episode}"
     tail = f"{metadata.task}, scenario {recorded.scenario} of {metadata.split}"
     tail += _noise_in_words(metadata)
@@ -121,7 +120,7 @@ def replay(root: Path, episode: int) -> Replay:
             spec,
             cells[step],
             {camera: shown[step] for camera, shown in pictures.items()},
-            _curves(spec, errors, step),
+            curves.at(step),
             (head, tail),
             (step, len(actions), recorded.success),
         )
@@ -236,34 +235,47 @@ def _frame(
     return np.asarray(frame)
 
 
-def _curves(spec: "Spec", errors: npt.NDArray[Any], step: int) -> Picture:
+class _Curves:
     """Lengths and angles over the steps, bold up to now, with the tolerances.
+
+    What all frames share is drawn once, and what has happened by now over it: ten times as fast as
+    drawing all of it for every frame.
 
     Args:
         spec: Whose tolerances are drawn.
         errors: (steps + 1, k), the metrics of the task.
-        step: Now.
-
-    Returns:
-        uint8 (CURVES_HEIGHT, WIDTH, 3).
     """
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(WIDTH / DPI, CURVES_HEIGHT / DPI), dpi=DPI, facecolor=_hex(PAPER))
-    figure.subplots_adjust(left=0.075, right=0.982, bottom=0.2, top=0.88, wspace=0.2)
-    lines: dict[str, list[tuple[str, int, float | None]]] = {}
-    for index, metric in enumerate(spec.metrics):
-        if metric.bound is not None and metric.over == "step":
-            line = (metric.title.removesuffix(" error"), index, metric.bound)
-            lines.setdefault(metric.unit, []).append(line)
-    for axes, (unit, drawn) in zip(
-        np.ravel(figure.subplots(1, len(lines))), lines.items(), strict=True
-    ):
-        _plot(axes, f"error ({unit})", drawn, errors, step)
-    picture = io.BytesIO()
-    figure.savefig(picture, format="rgba", dpi=DPI)
-    pixels = np.frombuffer(picture.getvalue(), np.uint8)
-    return pixels.reshape(CURVES_HEIGHT, WIDTH, 4)[..., :3].copy()
+    def __init__(self, spec: "Spec", errors: npt.NDArray[Any]) -> None:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(WIDTH / DPI, CURVES_HEIGHT / DPI), dpi=DPI, facecolor=_hex(PAPER))
+        figure.subplots_adjust(left=0.075, right=0.982, bottom=0.2, top=0.88, wspace=0.2)
+        diagrams: dict[str, list[tuple[str, int, float | None]]] = {}
+        for index, metric in enumerate(spec.metrics):
+            if metric.bound is not None and metric.over == "step":
+                line = (metric.title.removesuffix(" error"), index, metric.bound)
+                diagrams.setdefault(metric.unit, []).append(line)
+        self._lines = [
+            line
+            for axes, (unit, lines) in zip(
+                np.ravel(figure.subplots(1, len(diagrams))), diagrams.items(), strict=True
+            )
+            for line in _plot(axes, f"error ({unit})", lines, errors)
+        ]
+        canvas: Any = FigureCanvasAgg(figure)
+        canvas.draw()
+        self._canvas, self._shared = canvas, canvas.copy_from_bbox(figure.bbox)
+
+    def at(self, step: int) -> Picture:
+        """Draw what is known at a step, uint8 (CURVES_HEIGHT, WIDTH, 3)."""
+        self._canvas.restore_region(self._shared)
+        for line, values in self._lines:
+            line.set_data(np.arange(step + 1), values[: step + 1])
+            line.set_markevery([step])
+            line.axes.draw_artist(line)
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
 
 def _plot(
@@ -271,25 +283,32 @@ def _plot(
     title: str,
     lines: Sequence[tuple[str, int, float | None]],
     errors: npt.NDArray[Any],
-    step: int,
-) -> None:
-    """One diagram: errors over steps on a logarithmic axis."""
+) -> list[tuple[Any, npt.NDArray[Any]]]:
+    """One diagram: errors over steps on a logarithmic axis.
+
+    Returns:
+        What is still to be drawn for each step, a line that ends in a dot, and its values.
+    """
     steps = np.arange(len(errors))
+    bounds = [tolerance for _, _, tolerance in lines if tolerance is not None]
     shown = np.maximum(np.abs(errors[:, [index for _, index, _ in lines]]), _FLOOR)
+    moving = []
     for number, ((name, _, tolerance), colour) in enumerate(
         zip(lines, ("#e9620a", "#2b6cb0"), strict=False)
     ):
         values = shown[:, number]
         axes.plot(steps, values, color=colour, alpha=0.25, linewidth=1.5)
-        axes.plot(steps[: step + 1], values[: step + 1], color=colour, linewidth=2.2, label=name)
-        axes.plot(step, values[step], "o", color=colour, markersize=5)
+        [line] = axes.plot([], color=colour, linewidth=2.2, label=name, animated=True)
+        line.set(marker="o", markersize=5)
+        moving.append((line, values))
         if tolerance is not None:
             axes.axhline(tolerance, color=_hex(GREEN), linewidth=1.0, linestyle="--")
             axes.annotate(
                 f"≤ {tolerance:g}",
                 (0.0, tolerance),
                 xycoords=("axes fraction", "data"),
-                xytext=(4, 3),
+                # The smaller of two bounds below its line: they may be close to each other.
+                xytext=(4, 3 if tolerance == max(bounds) else -11),
                 textcoords="offset points",
                 fontsize=8,
                 color=_hex(GREEN),
@@ -297,7 +316,6 @@ def _plot(
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes.minorticks_off()
-    bounds = [tolerance for _, _, tolerance in lines if tolerance is not None]
     low = min(float(shown.min()), *bounds) if bounds else float(shown.min())
     axes.set_ylim(low / 2.5, max(float(shown.max()), *bounds) * 2.0)
     axes.set_xlim(0, len(errors) - 1)
@@ -311,6 +329,7 @@ def _plot(
         side.set_color(_hex(TRACK))
     if len(lines) > 1:
         axes.legend(fontsize=8, frameon=False, loc="upper right")
+    return moving
 
 
 def _hex(colour: tuple[int, int, int]) -> str:
