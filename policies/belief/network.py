@@ -210,7 +210,10 @@ class BeliefNetwork(nn.Module):
                 for n, (c, side) in shape.cameras.items()
             }
         )
-        self.belief = Belief(cameras, cell.period_s, offsets=shape.offsets)
+        # Its constants are few, and what makes such on the "meta" device, where the shapes of a
+        # checkpoint are checked, imports a compiler: longer than all else that loading takes.
+        with torch.device("cpu"):
+            self.belief = Belief(cameras, cell.period_s, offsets=shape.offsets)
         self.register_buffer("lowest_m", torch.tensor(-1.0))
         self.register_buffer(
             "joint_range", torch.tensor(JOINT_RANGE_RAD, dtype=torch.float32), persistent=False

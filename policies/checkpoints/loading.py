@@ -6,6 +6,7 @@ Tests hold that both ways give the same action. Anything else goes through LeRob
 """
 
 import dataclasses
+import functools
 import hashlib
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -22,6 +23,7 @@ from hvs_suite.policies.belief.acting import CompiledBelief
 from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
 from hvs_suite.policies.belief.settings import Settings
 from hvs_suite.policies.checkpoints.files import (
+    CONFIG,
     POSTPROCESSOR,
     PREPROCESSOR,
     WEIGHTS,
@@ -302,8 +304,7 @@ Player = tuple[Decide, Callable[[], None]]
 
 def _network(folder: Path, config: Mapping[str, Any]) -> Player:
     """Play the network of an `hvs` checkpoint by itself."""
-    network = load_network(folder)
-    compiled = CompiledBelief(network)
+    network, compiled = _compiled(folder, weights_digest(folder), (folder / CONFIG).read_bytes())
     memory: Tensor | None = None
 
     def decide(batch: Batch) -> Tensor:
@@ -317,6 +318,21 @@ def _network(folder: Path, config: Mapping[str, Any]) -> Player:
         memory = None
 
     return decide, forget
+
+
+# What TorchScript compiles holds 40 MB until the process ends; a study, which plays one checkpoint
+# in dozens of cells, compiles it once.
+@functools.lru_cache(maxsize=32)
+def _compiled(folder: Path, weights: str, config: bytes) -> tuple[BeliefNetwork, CompiledBelief]:
+    """A network and its compiled form, neither of which remembers an episode.
+
+    Args:
+        folder: The checkpoint.
+        weights: Their digest: with other content, the same folder is another checkpoint.
+        config: Content of its ``config.json``, likewise.
+    """
+    network = load_network(folder)
+    return network, CompiledBelief(network)
 
 
 def _lerobot(folder: Path) -> Player:

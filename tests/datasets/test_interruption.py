@@ -15,7 +15,7 @@ SCRIPT = Path(__file__).with_name("interrupted_recorder.py")
 EPISODES, BLOCK = 7, 2
 
 
-@pytest.fixture(scope="module", params=[3, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=[2, pytest.param(20, marks=pytest.mark.slow)])
 def interrupted(request, tmp_path_factory):
     """Folder of all datasets, and what the script says of them."""
     folder = tmp_path_factory.mktemp("interrupted")

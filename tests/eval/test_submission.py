@@ -18,7 +18,6 @@ from hvs_suite.eval.scoring import action_log, result_file, verification
 
 RESULTS = Path(__file__).parents[2] / "eval" / "results"
 COMMITTED = sorted(RESULTS.rglob("*.json"))
-SAMPLE = 3
 
 
 @pytest.fixture
@@ -257,6 +256,9 @@ def test_the_committed_results_keep_the_rules() -> None:
     assert ours.shipped() == ours.found(RESULTS)
 
 
+@pytest.mark.parametrize("sample", [1, pytest.param(10, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("path", COMMITTED, ids=lambda path: f"{path.parent.name}-{path.stem}")
-def test_a_committed_result_comes_out_again_when_its_actions_are_played(path: Path) -> None:
-    assert verification.verify(path, sample=SAMPLE).n_played == SAMPLE
+def test_a_committed_result_comes_out_again_when_its_actions_are_played(
+    path: Path, sample: int
+) -> None:
+    assert verification.verify(path, sample=sample).n_played == sample

@@ -202,6 +202,30 @@ def test_the_player_without_lerobot_acts_like_lerobot_over_an_episode(played):
             assert torch.equal(ours * 2**20, torch.round(ours * 2**20))
 
 
+def test_players_of_one_checkpoint_believe_what_each_has_seen(played):
+    spec, _, folder = played
+    first, second = observations(spec, 2)
+    one_player, other = (CheckpointPolicy(folder, spec) for _ in range(2))
+    fresh = one_player.select_action(first)
+    later = one_player.select_action(second)
+    assert np.array_equal(other.select_action(first), fresh)
+    assert np.array_equal(other.select_action(second), later)
+
+
+def test_a_folder_is_another_checkpoint_once_its_weights_are_others(played, tmp_path):
+    from safetensors.torch import load_file, save_file
+
+    spec, _, folder = played
+    kept = shutil.copytree(folder, tmp_path / "kept")
+    [observation] = observations(spec, 1)
+    before = CheckpointPolicy(kept, spec).select_action(observation)
+    weights = load_file(kept / "model.safetensors")
+    last = max(name for name in weights if name.startswith("network.head.") and "bias" in name)
+    weights[last] += 1.0
+    save_file(weights, kept / "model.safetensors")
+    assert not np.array_equal(CheckpointPolicy(kept, spec).select_action(observation), before)
+
+
 def test_what_is_believed_is_kept_to_the_end_of_the_episode_and_no_longer(played):
     spec, policy, _ = played
     first, second = (one(spec, observation) for observation in observations(spec, 2))
