@@ -16,7 +16,7 @@ TASK ?= align-thesis
 reproduce: .venv/.up-to-date  ## record, pretrain, fine-tune and evaluate TASK's shipped policy anew, in runs/
 	@.venv/bin/hvs reproduce --task $(TASK)
 
-test: lint  ## ruff, mypy and every behaviour once (16 to 18 minutes)
+test: lint  ## ruff, mypy and every behaviour once (under 15 minutes)
 	@$(PYTEST) -m "not slow"
 
 test-full: lint  ## the same on the large counts (up to 80 minutes)
