@@ -238,8 +238,8 @@ def _frame(
 class _Curves:
     """Lengths and angles over the steps, bold up to now, with the tolerances.
 
-    What all frames share is drawn once, and what has happened by now over it: ten times as fast as
-    drawing all of it for every frame.
+    What all frames share is drawn once, and what has happened by now over it, which takes less time
+    than to draw all of it for every frame.
 
     Args:
         spec: Whose tolerances are drawn.
