@@ -53,6 +53,8 @@ class Pretrain(Players):
             lean.
         offsets: Cameras whose pose is not exact, joined by +: the belief finds out how they are
             shifted and turned; for targets in sequence.
+        without: Parts of the design to leave out, joined by +, to see what they are good for:
+            memory of what was seen; keypoints, without which the eyes learn from goals and actions.
         batch_size: Frames that the eyes learn from in a step.
         device: Where the eyes learn: cpu or cuda. The rest learns on the processor.
         learning_rate: Peak of the schedule.
@@ -77,6 +79,7 @@ class Pretrain(Players):
     eye_share: float = 0.5
     slopes: str | None = None
     offsets: str | None = None
+    without: str | None = None
     batch_size: int = 64
     device: str = "cpu"
     learning_rate: float = 2e-3
@@ -109,6 +112,7 @@ class Pretrain(Players):
                 eye_share=self.eye_share,
                 slopes=() if self.slopes is None else tuple(self.slopes.split("+")),
                 offsets=() if self.offsets is None else tuple(self.offsets.split("+")),
+                without=() if self.without is None else tuple(self.without.split("+")),
                 batch_size=self.batch_size,
                 learning_rate=self.learning_rate,
                 workers=self.players(local=2),

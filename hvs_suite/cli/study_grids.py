@@ -191,35 +191,20 @@ class ThesisRuns(Grid):
 class Ablation(Grid):
     """Measure what each design choice of the hvs policy contributes, by training without it.
 
-    Every policy learns from the same data with the same steps, and is judged on the same scenarios
-    of split dev. Interrupted, the same command goes on.
+    On one task a family. Every policy of a task learns from the same data with the same steps, and
+    is judged on the same scenarios of split dev. Interrupted, the same command goes on.
 
     Attributes:
-        data: Recorded dataset; its task is played.
-        steps: Optimiser steps of each policy.
-        dagger_rounds: DAgger rounds, where they are not what is left out.
-        dagger_frames: Frames a round.
-        episodes: Scenarios that each policy is judged on.
+        task: Named task; give it several times; one of each family by default.
     """
 
-    data: Path
-    steps: int = 4000
-    dagger_rounds: int = 3
-    dagger_frames: int = 6000
-    episodes: int = 200
+    task: tuple[str, ...] = ()
 
     def plan(self) -> "Plan":
         """The policy as it is, and without one thing at a time."""
         from hvs_suite.eval.studies import ablation
 
-        return ablation.plan(
-            self.data,
-            steps=self.steps,
-            dagger_rounds=self.dagger_rounds,
-            dagger_frames=self.dagger_frames,
-            episodes=self.episodes,
-            quick=self.quick,
-        )
+        return ablation.plan(self.task, quick=self.quick)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

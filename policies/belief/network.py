@@ -131,6 +131,8 @@ class Shape:
         foresight: Control steps of which it remembers where the target was, to say where it will be
             (`hvs_suite.policies.belief.foresight`); with 0, it takes the believed acceleration to
             last.
+        remembers: Whether it remembers what it has seen; without, each observation is like the
+            first, but for where the arm has been sent.
     """
 
     cameras: Mapping[str, tuple[int, int]]
@@ -148,6 +150,7 @@ class Shape:
     slopes_by: Literal["contrasts", "colour"] = "contrasts"
     offsets: tuple[str, ...] = ()
     foresight: int = 0
+    remembers: bool = True
 
 
 MEMORY_SIZE = BELIEF_SIZE + 2 * N_JOINTS + 2 + RECENT_SIZE
@@ -354,6 +357,8 @@ class BeliefNetwork(nn.Module):
         Returns:
             (B, k).
         """
+        if not self.shape.remembers:
+            memory = self._forgotten(memory)
         q = self._joints(memory, q)
         if rays is None or not self.shape.reads_positions:
             views = self.views(geometry.flange_motion(q.double()))
@@ -388,6 +393,14 @@ class BeliefNetwork(nn.Module):
             believed[:, BELIEF_SIZE:],
         ]
         return torch.cat(parts, dim=1)
+
+    def _forgotten(self, memory: Tensor) -> Tensor:
+        """A memory (B, k) of nothing but what was sent and felt."""
+        fresh = self.start(len(memory))
+        sent, felt = slice(SET_POINT.start, RECENT.start), slice(MEMORY_SIZE, self._past.start)
+        for kept in (sent, felt):
+            fresh[:, kept] = memory[:, kept]
+        return fresh
 
     def feel(
         self,

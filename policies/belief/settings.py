@@ -94,6 +94,7 @@ class Settings(pydantic.BaseModel):
         slopes_by: See `Shape`.
         offsets: See `Shape`.
         foresight: See `Shape`.
+        remembers: See `Shape`.
     """
 
     model_config = pydantic.ConfigDict(extra="ignore")
@@ -117,6 +118,7 @@ class Settings(pydantic.BaseModel):
     slopes_by: Literal["contrasts", "colour"] = "contrasts"
     offsets: tuple[Literal["eih", "eth"], ...] = ()
     foresight: Annotated[int, pydantic.Field(strict=True, ge=0, le=_MOST_PAST)] = 0
+    remembers: Annotated[bool, pydantic.Field(strict=True)] = True
 
     @pydantic.model_validator(mode="after")
     def _fit(self) -> "Settings":
@@ -175,6 +177,7 @@ class Settings(pydantic.BaseModel):
             slopes_by=self.slopes_by,
             offsets=self.offsets,
             foresight=self.foresight,
+            remembers=self.remembers,
         )
 
     def network(self) -> BeliefNetwork:

@@ -45,6 +45,7 @@ class HvsConfig(PreTrainedConfig):
         offsets: Cameras whose pose is not exact, see `Shape`.
         foresight: Control steps of which it remembers where the target was, see `Shape`; a new
             policy, where the targets of its dataset move.
+        remembers: Whether it remembers what it has seen, see `Shape`.
         family: Family of the tasks that it was trained for.
         control_period_s: Length of their control step (s).
         options: Options of the task that it was trained with, where they differ from the named one;
@@ -77,6 +78,7 @@ class HvsConfig(PreTrainedConfig):
     slopes_by: str = "contrasts"
     offsets: tuple[str, ...] = ()
     foresight: int = 0
+    remembers: bool = True
     family: str = FAMILY
     control_period_s: float = CONTROL_PERIOD_S
     options: dict[str, Any] = field(default_factory=dict)

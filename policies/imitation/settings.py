@@ -26,6 +26,8 @@ from hvs_suite.registry import find
 from hvs_suite.tasks.shared.spec import PRESETS
 
 INPUTS = PRESETS["vision"]
+PARTS = ("memory", "keypoints")
+"""What of the design may be left out."""
 
 if TYPE_CHECKING:
     from hvs_suite.policies.hvs.modeling_hvs import HvsPolicy
@@ -57,6 +59,9 @@ class Settings:
             the rest. With 1 there is nothing but eyes, for another run to begin with.
         slopes: Cameras whose eyes tell the slope of the surface.
         offsets: Cameras whose pose is not exact: how they are shifted and turned is found out.
+        without: What to leave out, of `PARTS`, to see what it is good for: ``memory`` of what was
+            seen, and ``keypoints``, from which the eyes learn; without them they learn from what
+            belief and head make of what they see.
     """
 
     seed: int = 0
@@ -78,6 +83,7 @@ class Settings:
     eye_share: float = 0.5
     slopes: tuple[str, ...] = ()
     offsets: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
 
     def reads(self, name: str) -> bool:
         """Whether the policy is given an input."""
@@ -94,6 +100,8 @@ class Settings:
         """
         if unknown := sorted({*(self.inputs or ())} - {*INPUTS}):
             raise OptionError(f"unknown input {unknown[0]!r}; choose from {', '.join(INPUTS)}")
+        if unknown := sorted({*self.without} - {*PARTS}):
+            raise OptionError(f"unknown part {unknown[0]!r}; choose from {', '.join(PARTS)}")
         cameras = [name for name in manifest.cameras if self.reads(name)]
         if unknown := sorted({*self.slopes, *self.offsets, *self.kept_eyes} - {*cameras}):
             raise OptionError(f"unknown camera {unknown[0]!r}; choose from {', '.join(cameras)}")
@@ -189,6 +197,7 @@ def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":
         slopes_by="colour",
         offsets=settings.offsets,
         foresight=PAST_STEPS if manifest.has_moving_targets else 0,
+        remembers="memory" not in settings.without,
         **trained_for(task).model_dump(),
     )
     # torch initialises weights from its global generator; leave that as it was found.

@@ -137,18 +137,19 @@ class Teacher:
             rows: Frames to learn from.
             step: Number of the optimiser step, which all draws are a function of.
         """
-        if self._eyes_learn:
+        network, settings = self.policy.network, self._settings
+        if self._eyes_learn and "keypoints" not in settings.without:
             loss, parts = self._eye_lesson(rows)
         else:
-            key = np.random.Philox(key=[self._settings.seed, WINDOW_STREAM], counter=step)
-            window = self._windows.draw(
-                self.policy.network,
-                self.demonstrations.weights(),
-                self._settings.windows,
-                self._settings.window_steps,
-                np.random.Generator(key),
-            )
-            loss, parts = window_lesson(self.policy.network, window)
+            key = np.random.Philox(key=[settings.seed, WINDOW_STREAM], counter=step)
+            random, length = np.random.Generator(key), settings.window_steps
+            weights = self.demonstrations.weights()
+            if self._eyes_learn:
+                n = max(1, settings.batch_size // length)
+                window = self._windows.see(network, weights, n, length, random)
+            else:
+                window = self._windows.draw(network, weights, settings.windows, length, random)
+            loss, parts = window_lesson(network, window)
         return loss, {name: part.item() for name, part in parts.items()}
 
     def _eye_lesson(self, rows: Rows) -> tuple[Tensor, dict[str, Tensor]]:

@@ -26,23 +26,28 @@ from hvs_suite.eval.studies import (
 from hvs_suite.eval.studies.grid import Cell, Finished, Judged, Maker, Plan, Study, run_grid
 from hvs_suite.eval.studies.training import Scenes
 from hvs_suite.eval.studies.ways import Imitation, Recording
-from hvs_suite.policies.training.dataset import read_manifest
-from hvs_suite.registry import find
+from hvs_suite.registry import TASKS, find
 from hvs_suite.rollout import one_torch_thread
 
 SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "align-thesis"
 STUDIES: dict[str, Callable[..., Plan]] = {
     module.__name__.rpartition(".")[2]: module.plan
-    for module in (inputs, resolution, randomisation, rewards, start_goal, curriculum, thesis_runs)
+    for module in (
+        ablation,
+        inputs,
+        resolution,
+        randomisation,
+        rewards,
+        start_goal,
+        curriculum,
+        thesis_runs,
+    )
 }
 PLANS = {
     f"{name}{' quick' if quick else ''}": make(quick=quick)
     for name, make in STUDIES.items()
     for quick in (False, True)
 } | {
-    "ablation": ablation.plan(
-        SAMPLE, steps=2, dagger_rounds=1, dagger_frames=8, episodes=2
-    ),
     "few_demonstrations": few_demonstrations.plan(
         SAMPLE, demonstrations=[3, 5], teachers=["expert", "servo"], env_steps=120, base_steps=2,
         imitation_steps=3, imitation_rounds=2, episodes=2, eyes="align-hard",
@@ -124,14 +129,19 @@ def test_plans_are_whole(plan, tmp_path):
 
 
 def test_ablations_lack_what_they_say():
-    settings = {cell.name: cell.way.settings for cell in PLANS["ablation"].cells}
-    assert "eih" not in settings["no eye in hand"]["inputs"]
-    assert "joint_positions" in settings["no eye in hand"]["inputs"]
-    assert settings["no DAgger"]["dagger_rounds"] == 0
-    assert settings["everything"]["dagger_rounds"] == 1
-    # A sample of five episodes cannot be quartered.
-    assert read_manifest(SAMPLE).n_episodes == 5
-    assert not [name for name in settings if "of the data" in name]
+    settings = {(cell.group, cell.name): cell.way.settings for cell in PLANS["ablation"].cells}
+    tilted = {name: each for (task, name), each in settings.items() if task == "surface-tilted"}
+    assert "eih" not in tilted["no eye in hand"]["inputs"]
+    assert "joint_positions" in tilted["no eye in hand"]["inputs"]
+    assert "slopes" not in tilted["no eye in hand"]
+    assert tilted["no eye to hand"]["slopes"] == ("eih",)
+    assert tilted["no DAgger"]["dagger_rounds"] == 0
+    assert tilted["everything"]["dagger_rounds"] == 2
+    assert {TASKS[task].family for task, _ in settings} == {spec.family for spec in TASKS.values()}
+    [only] = {cell.group for cell in ablation.plan(["track-line"]).cells}
+    assert only == "track-line"
+    with pytest.raises(OptionError, match="no ablation of 'track-hard'; choose from align-thesis"):
+        ablation.plan(["track-hard"])
 
 
 def judged(solved: str, scenes: str = "dev") -> Judged:

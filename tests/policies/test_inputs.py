@@ -37,6 +37,22 @@ def test_what_is_not_read_changes_nothing(part: slice, option: str) -> None:
         assert same is not reads
 
 
+def test_without_a_memory_nothing_counts_but_what_is_seen_now_and_where_the_arm_was_sent() -> None:
+    torch.manual_seed(0)
+    cell, q = cell_model(hvs_suite.TASKS["align-thesis"]), torch.full((1, 7), 0.3)
+    now = {name: torch.randn(1, 9) for name in CAMERAS}
+    for remembers in (True, False):
+        network = BeliefNetwork(Shape(CAMERAS, hidden=8, remembers=remembers), cell)
+        ends = []
+        for sent in (0.3, 0.3, 0.31):
+            seen = {name: torch.randn(1, 9) for name in CAMERAS}
+            memory = network.remember(network.start(1), seen, q)
+            memory = network.commanded(memory, torch.full((1, 7), sent) / network.joint_range)
+            ends.append(network.remember(memory, now, q))
+        assert torch.equal(ends[0], ends[1]) is not remembers
+        assert not torch.equal(ends[1], ends[2])
+
+
 def test_without_positions_the_arm_is_reckoned_from_where_it_started() -> None:
     cell = cell_model(hvs_suite.TASKS["align-thesis"])
     network = BeliefNetwork(Shape(CAMERAS, hidden=8, reads_positions=False), cell)

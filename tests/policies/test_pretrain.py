@@ -204,6 +204,24 @@ def test_eyes_can_learn_alone(dataset, tmp_path):
     assert all(".eyes." in name for name in changed)
 
 
+def test_without_keypoints_the_eyes_learn_from_what_belief_and_head_make_of_it(dataset, tmp_path):
+    options = {"batch_size": 8, "windows": 2, "window_steps": 4, "without": ("keypoints",)}
+    pretrain(dataset, tmp_path / "begun", **options, steps=1)
+    pretrain(dataset, tmp_path / "learned", **options, steps=6)
+    before, after = weights(tmp_path / "begun"), weights(tmp_path / "learned")
+    changed = {name for name in after if (after[name] != before[name]).any()}
+    assert {name.split(".")[1] for name in changed} >= {"eyes", "belief", "head"}
+
+
+def test_a_policy_may_be_made_without_a_memory(dataset, tmp_path):
+    pretrain(dataset, tmp_path / "out", without=("memory",), **STEP)
+    assert not json.loads((tmp_path / "out/config.json").read_text())["remembers"]
+    assert not load_network(tmp_path / "out").shape.remembers
+    check_compiled(tmp_path / "out")
+    with pytest.raises(OptionError, match="unknown part 'head'; choose from memory, keypoints"):
+        pretrain(dataset, tmp_path / "other", without=("head",), **STEP)
+
+
 def test_eyes_alone_learn_slopes_once_they_have_found_the_target(dataset, tmp_path):
     options = {"steps": 2, "batch_size": 4, "eye_share": 1.0, "slopes": ("eih",)}
     pretrain(dataset, tmp_path / "out", **options)
