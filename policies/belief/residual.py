@@ -151,8 +151,9 @@ class Residual(nn.Module):
         Returns:
             As ``memory``.
         """
-        by = share.clamp(-1.0, 1.0).double() * self.step * self.is_near(memory, goal)
+        by = share.clamp(-1.0, 1.0).double() * self.step
         most = MOST_STEPS * self.step
-        shift = (memory[:, None, SHIFT] @ axes)[:, 0] + by
+        # What was found at one goal says nothing of the next.
+        shift = ((memory[:, None, SHIFT] @ axes)[:, 0] + by) * self.is_near(memory, goal)
         shift = torch.maximum(torch.minimum(shift, most), -most)
         return torch.cat([(axes @ shift[:, :, None])[:, :, 0], memory[:, CLOCK.start :]], dim=1)

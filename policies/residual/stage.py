@@ -3,7 +3,8 @@
 Pictures never leave the process that plays: what goes into the replay memory is what the frozen
 eyes, the belief and the arm's geometry made of them. As long as the tip is far from the goal no
 action has an effect (`hvs_suite.policies.belief.residual`), so the policy flies there by itself,
-and an episode begins with the first step in which one has.
+and an episode begins with the first step in which one has. Where goals follow each other, each is
+an episode of its own: a goal that is reached pays, and the way to the next is flown again.
 
 Critics also see what only the simulator knows; the actor, which has to do without in the end, does
 not.
@@ -24,7 +25,7 @@ from torch import Tensor
 from hvs_suite.errors import PolicyError
 from hvs_suite.policies.belief.acting import CompiledParts
 from hvs_suite.policies.belief.network import FELT
-from hvs_suite.policies.belief.residual import FINE_M, N_LENGTHS, SHIFT
+from hvs_suite.policies.belief.residual import FINE_M, LONG_S, N_LENGTHS, SHIFT
 from hvs_suite.policies.checkpoints.files import read_config
 from hvs_suite.policies.checkpoints.loading import network_inputs
 from hvs_suite.policies.residual.folding import load_base, with_residual
@@ -32,6 +33,8 @@ from hvs_suite.policies.residual.settings import Settings
 from hvs_suite.policies.rl.curriculum import Kind, Ladder, Level, levels_of
 from hvs_suite.registry import find, load
 from hvs_suite.rollout import one_torch_thread
+from hvs_suite.tasks.sequence import MISSED
+from hvs_suite.tasks.shared.rewards import GOAL_REWARD
 
 if TYPE_CHECKING:
     from hvs_suite.tasks.shared.environment import Environment
@@ -44,6 +47,8 @@ SCENES_A_SEED = 10**9
 """Runs with different seeds learn from different scenes."""
 MOST_FLIGHTS = 20
 """Scenes in a row in which the tip may come near no goal."""
+ANOTHER_M = 0.1
+"""A goal that was moved farther than this in a step is another one (m)."""
 SOON_S = 0.2
 """The goal's way in this time is what critics know of its motion."""
 
@@ -55,9 +60,9 @@ class Place:
     """How far a player has come: all that it takes to put it back there.
 
     Attributes:
-        episode: Number of the episode.
-        actions: Since it began, (3,) each.
-        played: Control steps of all episodes.
+        episode: Number of the scene.
+        actions: Since it began, (3,) each, those of flights included.
+        played: Control steps of all scenes.
         level: Of the curriculum.
         recent: How the last episodes ended on that level.
     """
@@ -75,15 +80,17 @@ class Stage(gymnasium.Env[Any, Any]):
     Observations are ``read``, what `Residual` reads, and ``privileged``: how far the tip is from
     the goal, how far the goal is from where it is believed to be after having been moved, and how
     it will move (3 each, in the goal's frame, logarithmic), what is left of the time, for how long
-    the goal was held, and each error over its bound. An action is three shares in [-1, 1].
+    there has been this goal and for how long it was held, and each error over its bound. An action
+    is three shares in [-1, 1].
 
-    The reward is the task's, less the cost of a step, and a potential beside it that changes no
+    The reward is the task's, or what reaching one of several goals pays, which is as much, less the
+    cost of a step, and a potential beside it that changes no
     best policy (Ng, Harada and Russell, 1999): gamma * phi(s') - phi(s), with phi(s) = -weight *
     sum of asinh(error / tolerance) over the errors that the task bounds, and 0 at the end of an
     episode.
 
-    ``info`` counts episodes and all control steps, those of the flights included; at the end of an
-    episode it says how it ended.
+    ``info`` counts scenes and all control steps, those of the flights included, and has the actions
+    since the scene began; at the end of an episode it says how it ended.
 
     Args:
         make: What to play.
@@ -108,9 +115,11 @@ class Stage(gymnasium.Env[Any, Any]):
         self._bounds = make.bounds
         self._step_bounds = find(make.task).with_options(make.options).step_bounds
         self._place = make.place
-        self._episode, self._played = make.place.episode, make.place.played
+        self._scene, self._played = make.place.episode, make.place.played
+        self._is_over, self._is_another, self._is_reached = True, False, False
+        self._actions: list[list[float]] = []
         self._potential = self._return = 0.0
-        self._length = 0
+        self._age = 0
         self._memory: Tensor
         sizes = {
             READ: self._network.residual.n_inputs,
@@ -130,12 +139,14 @@ class Stage(gymnasium.Env[Any, Any]):
             seed: Not used; the scenes are the run's own.
             options: Not used.
         """
-        self._fly()
-        for action in self._place.actions:
-            self._play(np.array(action, np.float32))
-        # The flight there was counted already.
-        self._played = self._place.played or self._played
+        if self._place.actions:
+            self._begin()
+            for action in self._place.actions:
+                self._play(np.array(action, np.float32))
+            # These were counted already.
+            self._played = self._place.played
         self._place = Place()
+        self._fly()
         return self._observation(), self._counts()
 
     def step(
@@ -143,19 +154,19 @@ class Stage(gymnasium.Env[Any, Any]):
     ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Play a control step in which the goal is moved."""
         before = self._potential
-        over = self._play(action)
+        self._play(action)
         info = self._env.info
+        over = self._is_over or self._is_another
         after = 0.0 if over else self._potential
         reward = self._reward - self._make.settings.step_cost
         reward += self._make.settings.gamma * after - before
         ends: dict[str, Any] = {}
         if over:
-            self._episode += 1
             ends = {
-                "success": float(info["is_success"]),
+                "success": float(self._is_reached),
                 "collision": float(info["collision"]),
                 "return": self._return,
-                "length": float(self._length),
+                "length": float(self._age),
             }
         return self._observation(), reward, over, False, {**self._counts(), **ends}
 
@@ -164,56 +175,81 @@ class Stage(gymnasium.Env[Any, Any]):
         self._env.close()
 
     def _counts(self) -> dict[str, Any]:
-        return {"episode": self._episode, "played": self._played, **self._ladder.state_dict()}
+        counts = {"episode": self._scene, "played": self._played, "actions": self._actions.copy()}
+        return {**counts, **self._ladder.state_dict()}
 
     def _load(self) -> "Environment":
         """The task on the level that is due."""
         make, level = self._make, self._levels[self._ladder.level]
         return load(make.task, split=make.split, **{**make.options, **level})
 
+    def _begin(self) -> None:
+        """Begin the scene that is due, on the level that is due."""
+        make = self._make
+        if self._ladder.climb():
+            self._env.close()
+            self._env = self._load()
+        scenario = make.seed * SCENES_A_SEED + make.part
+        scenario += make.settings.environments * self._scene
+        self._memory = self._network.start(1)
+        self._actions, self._is_over, self._is_another = [], False, True
+        self._turn()
+        self._look(self._env.reset(scenario=scenario).observation)
+
+    def _turn(self) -> None:
+        """Turn to the next goal, if there is one."""
+        if self._is_another:
+            self._is_another, self._age, self._return = False, 0, 0.0
+
     def _fly(self) -> None:
-        """Play scenes until an action has an effect; mostly that is in the first of them.
+        """Play until an action has an effect; mostly that is in this scene or in the next.
 
         Raises:
             PolicyError: In many there is none.
         """
-        make = self._make
+        self._turn()
         for _ in range(MOST_FLIGHTS):
-            if self._ladder.climb():
-                self._env.close()
-                self._env = self._load()
-            scenario = make.seed * SCENES_A_SEED + make.part
-            scenario += make.settings.environments * self._episode
-            self._memory = self._network.start(1)
-            self._return, self._length = 0.0, 0
-            over = False
-            self._look(self._env.reset(scenario=scenario).observation)
-            while not over and not self._is_near():
-                over = self._play(np.zeros(N_LENGTHS, np.float32))
-            if not over:
+            if self._is_over:
+                self._begin()
+            while not self._is_over and not self._is_near():
+                self._play(np.zeros(N_LENGTHS, np.float32))
+            if not self._is_over:
                 return
-            self._episode += 1
+        make = self._make
         raise PolicyError(
             f"{make.folder} came within {make.settings.reach_m:g} m of the goal in none of "
             f"{MOST_FLIGHTS} scenes of {make.task}, so there is nothing to fine-tune"
         )
 
-    def _play(self, action: npt.NDArray[np.float32]) -> bool:
-        """One control step; whether it was the last of the episode."""
+    def _play(self, action: npt.NDArray[np.float32]) -> None:
+        """Play one control step, and note what came of it."""
         with one_torch_thread(), torch.inference_mode():
             share = torch.from_numpy(action)[None]
             command, self._memory = self._parts.respond(
                 self._memory, self._sightings, self._inputs.state, share, self._inputs.felt
             )
+        self._turn()
+        goal, missed = self._env.goal().position, self._missed()
         time_step = self._env.step(command[0].numpy())
         self._reward = float(time_step.reward or 0.0)
-        self._return += self._reward
-        self._length += 1
+        self._is_reached = bool(self._env.info["is_success"])
+        if not self._is_reached and self._missed() < missed:
+            self._reward += GOAL_REWARD
+            self._is_reached = True
         self._played += 1
+        self._actions.append(action.tolist())
+        self._is_over = bool(time_step.last())
+        self._is_another = float(np.linalg.norm(self._env.goal().position - goal)) > ANOTHER_M
+        self._age += 1
+        self._return += self._reward
         self._look(time_step.observation)
-        if over := bool(time_step.last()):
+        if self._is_over:
+            self._scene += 1
             self._ladder.note(bool(self._env.info["is_success"]))
-        return over
+
+    def _missed(self) -> float:
+        """How many goals have not been reached, where there are several."""
+        return float(self._env.info["errors"].get(MISSED, 0.0))
 
     def _look(self, observation: Mapping[str, npt.NDArray[Any]]) -> None:
         self._inputs = inputs = network_inputs(self._network, self._config, observation)
@@ -226,6 +262,10 @@ class Stage(gymnasium.Env[Any, Any]):
         self._potential = -self._make.settings.shaping * float(np.arcsinh(relative).sum())
 
     def _is_near(self) -> bool:
+        """Whether the tip is near the goal, and near where that is believed to be."""
+        env = self._env
+        if np.linalg.norm(env.goal().position - env.tip().position) > self._make.settings.reach_m:
+            return False
         residual = self._network.residual
         assert residual is not None
         goal, _ = self._network.goal_frame(self._memory)
@@ -240,7 +280,11 @@ class Stage(gymnasium.Env[Any, Any]):
         info, spec = env.info, env.spec
         privileged = [
             np.arcsinh(ways.reshape(3, 3) @ axes / FINE_M).reshape(-1),
-            [1.0 - env.control_steps / spec.time_limit_steps, info["n_inside"] / spec.hold_steps],
+            [
+                1.0 - env.control_steps / spec.time_limit_steps,
+                self._age * spec.control_period_s / LONG_S,
+                info["n_inside"] / spec.hold_steps,
+            ],
             [np.arcsinh(info["errors"][name] / bound) for name, bound in self._bounds.items()],
         ]
         return {
@@ -277,14 +321,14 @@ class MakeStage:
 
     @property
     def bounds(self) -> dict[str, float]:
-        """Bounds of the task's metrics, by name."""
+        """Bounds of the task's metrics above 0, by name."""
         spec = find(self.task).with_options(self.options)
-        return {metric.name: metric.bound for metric in spec.metrics if metric.bound is not None}
+        return {metric.name: metric.bound for metric in spec.metrics if metric.bound}
 
     @property
     def n_privileged(self) -> int:
         """Numbers that only critics see."""
-        return 3 * N_LENGTHS + 2 + len(self.bounds)
+        return 3 * N_LENGTHS + 3 + len(self.bounds)
 
     def __call__(self) -> Stage:
         """Make it."""

@@ -264,9 +264,8 @@ def finetune(
             )
             seen = following
             for i in range(n):
-                actions = [] if over[i] else [*places[i].actions, action[i].tolist()]
                 counted = {name: int(info[name][i]) for name in ("episode", "played", "level")}
-                places[i] = Place(actions=actions, recent=info["recent"][i], **counted)
+                places[i] = Place(actions=info["actions"][i], recent=info["recent"][i], **counted)
                 if over[i]:
                     ended = info["final_info"]
                     names = ("success", "collision", "return", "length")

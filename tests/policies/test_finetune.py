@@ -305,6 +305,42 @@ def test_players_share_the_scenes_and_go_back_to_the_middle_of_one(base):
     np.testing.assert_array_equal(same[PRIVILEGED], seen[PRIVILEGED])
 
 
+WIDE = {"position_tolerance_mm": 5000.0, "tilt_tolerance_deg": 180.0, "hold_steps": 2}
+
+
+@pytest.mark.parametrize(("wide", "length", "earned"), [({}, 3, 0.0), (WIDE, 2, 1.0)])
+def test_each_of_several_goals_is_an_episode_that_pays_if_it_is_reached(
+    wide, length, earned, tmp_path
+):
+    from hvs_suite.policies.hvs.modeling_hvs import save_checkpoint
+
+    task, options = "sequence-thesis", {"n_targets": 2, "target_steps": 3, "time_limit_steps": 6}
+    save_checkpoint(new_policy(task), tmp_path)
+    make = MakeStage(task, options | wide, "train", str(tmp_path), SMALL, 0)
+    stage, scenes = make(), []
+    for _ in range(3):
+        seen, _ = stage.reset()
+        assert seen[PRIVILEGED].shape == (make.n_privileged,)
+        over, n = False, 0
+        while not over:
+            _, _, over, _, info = stage.step(np.zeros(3, np.float32))
+            n += 1
+        assert (n, info["length"], info["return"]) == (length, length, earned)
+        assert info["success"] == bool(earned)
+        scenes.append(info["episode"])
+    # Two goals a scene; its end is counted with the second.
+    assert scenes == [0, 1, 1]
+    # Killed after the first goal of the second scene, it goes on with the second.
+    again = dataclasses.replace(
+        make, place=Place(1, info["actions"], info["played"], 0, info["recent"])
+    )()
+    _, counted = again.reset()
+    assert counted["played"] == info["played"] == 3 * length
+    assert again._env.control_steps == length
+    again.close()
+    stage.close()
+
+
 def test_players_climb_a_curriculum_and_are_put_back_on_their_level(base):
     learnt = Place(recent=(True,) * 50)
     make = MakeStage(TASK, OPTIONS, "train", str(base), SMALL, 0, 0, learnt, "tolerance")
