@@ -38,7 +38,7 @@ class Finetune:
         gamma: Discount; 1 minus this is the share of success that one step less is worth.
         shaping: Weight of the potential beside the sparse reward, which shows the way to a goal
             that is rarely reached; 0 leaves the sparse reward alone.
-        step_cost: What a step costs.
+        step_cost: What a step outside the tolerances costs.
         updates: Updates a step.
         environments: How many play; they share the scenes between them.
         eval_every: Environment steps between evaluations; one more comes at start and end.

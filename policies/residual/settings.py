@@ -34,7 +34,7 @@ class Settings:
         target_noise: Standard deviation of the noise on the target's actions.
         penalty: Weight of the squared action against the normalised value.
         shaping: Weight of the potential, which is minus the logarithm of the error.
-        step_cost: What a step costs.
+        step_cost: What a step outside the tolerances costs.
         environments: How many play, in processes of their own; a single one in the learner's.
     """
 

@@ -84,10 +84,9 @@ class Stage(gymnasium.Env[Any, Any]):
     is three shares in [-1, 1].
 
     The reward is the task's, or what reaching one of several goals pays, which is as much, less the
-    cost of a step, and a potential beside it that changes no
-    best policy (Ng, Harada and Russell, 1999): gamma * phi(s') - phi(s), with phi(s) = -weight *
-    sum of asinh(error / tolerance) over the errors that the task bounds, and 0 at the end of an
-    episode.
+    cost of a step outside the tolerances, and a potential beside it that changes no best policy
+    (Ng, Harada and Russell, 1999): gamma * phi(s') - phi(s), with phi(s) = -weight * sum of
+    asinh(error / tolerance) over the errors that the task bounds, and 0 at the end of an episode.
 
     ``info`` counts scenes and all control steps, those of the flights included, and has the actions
     since the scene began; at the end of an episode it says how it ended.
@@ -158,7 +157,9 @@ class Stage(gymnasium.Env[Any, Any]):
         info = self._env.info
         over = self._is_over or self._is_another
         after = 0.0 if over else self._potential
-        reward = self._reward - self._make.settings.step_cost
+        reward = self._reward
+        if not info["n_inside"]:
+            reward -= self._make.settings.step_cost
         reward += self._make.settings.gamma * after - before
         ends: dict[str, Any] = {}
         if over:

@@ -308,24 +308,25 @@ def test_players_share_the_scenes_and_go_back_to_the_middle_of_one(base):
 WIDE = {"position_tolerance_mm": 5000.0, "tilt_tolerance_deg": 180.0, "hold_steps": 2}
 
 
-@pytest.mark.parametrize(("wide", "length", "earned"), [({}, 3, 0.0), (WIDE, 2, 1.0)])
-def test_each_of_several_goals_is_an_episode_that_pays_if_it_is_reached(
-    wide, length, earned, tmp_path
-):
+@pytest.mark.parametrize(("wide", "expected"), [({}, [-0.01, -0.01, -0.01]), (WIDE, [0.0, 1.0])])
+def test_each_of_several_goals_is_an_episode_that_pays_if_it_is_reached(wide, expected, tmp_path):
     from hvs_suite.policies.hvs.modeling_hvs import save_checkpoint
 
     task, options = "sequence-thesis", {"n_targets": 2, "target_steps": 3, "time_limit_steps": 6}
     save_checkpoint(new_policy(task), tmp_path)
-    make = MakeStage(task, options | wide, "train", str(tmp_path), SMALL, 0)
-    stage, scenes = make(), []
+    settings = dataclasses.replace(SMALL, shaping=0.0)
+    make = MakeStage(task, options | wide, "train", str(tmp_path), settings, 0)
+    stage, scenes, length, earned = make(), [], len(expected), max(0.0, *expected)
     for _ in range(3):
         seen, _ = stage.reset()
         assert seen[PRIVILEGED].shape == (make.n_privileged,)
-        over, n = False, 0
+        over, rewards = False, []
         while not over:
-            _, _, over, _, info = stage.step(np.zeros(3, np.float32))
-            n += 1
-        assert (n, info["length"], info["return"]) == (length, length, earned)
+            _, reward, over, _, info = stage.step(np.zeros(3, np.float32))
+            rewards.append(reward)
+        # A step inside the tolerances costs nothing.
+        assert rewards == expected
+        assert (info["length"], info["return"]) == (length, earned)
         assert info["success"] == bool(earned)
         scenes.append(info["episode"])
     # Two goals a scene; its end is counted with the second.
