@@ -33,7 +33,6 @@ from hvs_suite.policies.residual.settings import Settings
 from hvs_suite.policies.rl.curriculum import Kind, Ladder, Level, levels_of
 from hvs_suite.registry import find, load
 from hvs_suite.rollout import one_torch_thread
-from hvs_suite.tasks.sequence import MISSED
 from hvs_suite.tasks.shared.rewards import GOAL_REWARD
 
 if TYPE_CHECKING:
@@ -112,7 +111,10 @@ class Stage(gymnasium.Env[Any, Any]):
         assert self._network.residual is not None
         # Those of the task itself: what the critics read means the same on every level.
         self._bounds = make.bounds
-        self._step_bounds = find(make.task).with_options(make.options).step_bounds
+        spec = find(make.task).with_options(make.options)
+        self._step_bounds = spec.step_bounds
+        # What has to be 0 in the end counts the goals that have not been reached.
+        self._counted = [metric.name for metric in spec.metrics if metric.bound == 0.0]
         self._place = make.place
         self._scene, self._played = make.place.episode, make.place.played
         self._is_over, self._is_another, self._is_reached = True, False, False
@@ -250,7 +252,7 @@ class Stage(gymnasium.Env[Any, Any]):
 
     def _missed(self) -> float:
         """How many goals have not been reached, where there are several."""
-        return float(self._env.info["errors"].get(MISSED, 0.0))
+        return sum(self._env.info["errors"][name] for name in self._counted)
 
     def _look(self, observation: Mapping[str, npt.NDArray[Any]]) -> None:
         self._inputs = inputs = network_inputs(self._network, self._config, observation)
