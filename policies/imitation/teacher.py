@@ -144,11 +144,9 @@ class Teacher:
             key = np.random.Philox(key=[settings.seed, WINDOW_STREAM], counter=step)
             random, length = np.random.Generator(key), settings.window_steps
             weights = self.demonstrations.weights()
-            if self._eyes_learn:
-                n = max(1, settings.batch_size // length)
-                window = self._windows.see(network, weights, n, length, random)
-            else:
-                window = self._windows.draw(network, weights, settings.windows, length, random)
+            anew = self._eyes_learn
+            n = max(1, settings.batch_size // length) if anew else settings.windows
+            window = self._windows.draw(network, weights, n, length, random, anew=anew)
             loss, parts = window_lesson(network, window)
         return loss, {name: part.item() for name, part in parts.items()}
 

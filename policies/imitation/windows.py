@@ -139,6 +139,8 @@ class WindowPool:
         n: int,
         length: int,
         random: np.random.Generator,
+        *,
+        anew: bool = False,
     ) -> Window:
         """Draw windows; those of short episodes begin with them.
 
@@ -148,8 +150,26 @@ class WindowPool:
             n: How many.
             length: Of each, in control steps.
             random: Draws them, and the jitter.
+            anew: Have the eyes look at them now, without jitter, so that what is learned from them
+                reaches the eyes.
         """
-        window = self._window(*self._choose(weights, n, length, random), length, network)
+        if anew and (not self._columns or len(self._columns[STATE]) != len(self._demonstrations)):
+            self._memory = None
+            self._open(network)
+        episodes = random.choice(len(weights), n, p=weights)
+        # From a quarter of a window before the beginning, so that it is met often.
+        room = self._lengths[episodes] - length // 2
+        begins = random.uniform(-0.25 * length, np.maximum(room, 1)).astype(np.int64)
+        begins = np.maximum(begins, 0)
+        window = self._window(episodes, begins, length, network)
+        if anew:
+            rows = self._rows(episodes, begins, length)[window.counts]
+            batch = self._demonstrations.batch(rows.numpy())
+            sightings = {}
+            for name, sighting in network.look(*self.pictures(network, batch)).items():
+                sightings[name] = torch.zeros(n, length, sighting.shape[1])
+                sightings[name][window.counts] = sighting.cpu()
+            return dataclasses.replace(window, sightings=sightings)
         generator = torch.Generator().manual_seed(int(random.integers(2**32)))
         for sighting in window.sightings.values():
             alike, each = (torch.randn(n, k, 5, generator=generator) * JITTER for k in (1, length))
@@ -162,47 +182,6 @@ class WindowPool:
                 off[..., 3:] * sighting[..., LOG_SIGMA_SLOPE].clamp(max=0.0).exp()
             )
         return window
-
-    def see(
-        self,
-        network: BeliefNetwork,
-        weights: npt.NDArray[np.float64],
-        n: int,
-        length: int,
-        random: np.random.Generator,
-    ) -> Window:
-        """Draw windows and look at them now, so that what is learned from them reaches the eyes.
-
-        Args:
-            network: In training mode.
-            weights: As `draw` takes them, and the rest too.
-            n: How many.
-            length: Of each, in control steps.
-            random: Draws them.
-        """
-        if not self._columns or len(self._columns[STATE]) != len(self._demonstrations):
-            self._memory = None
-            self._open(network)
-        episodes, begins = self._choose(weights, n, length, random)
-        window = self._window(episodes, begins, length, network)
-        rows = self._rows(episodes, begins, length)[window.counts]
-        batch = self._demonstrations.batch(rows.numpy())
-        sightings = {}
-        for name, sighting in network.look(*self.pictures(network, batch)).items():
-            seen = sighting.new_zeros(n, length, sighting.shape[1])
-            seen[window.counts] = sighting
-            sightings[name] = seen.cpu()
-        return dataclasses.replace(window, sightings=sightings)
-
-    def _choose(
-        self, weights: npt.NDArray[np.float64], n: int, length: int, random: np.random.Generator
-    ) -> tuple[Rows, Rows]:
-        """Episodes, and where in them windows begin, (n,) each."""
-        episodes = random.choice(len(weights), n, p=weights)
-        # From a quarter of a window before the beginning, so that it is met often.
-        room = self._lengths[episodes] - length // 2
-        begins = random.uniform(-0.25 * length, np.maximum(room, 1)).astype(np.int64)
-        return episodes, np.maximum(begins, 0)
 
     def _rows(self, episodes: Rows, begins: Rows, length: int) -> Tensor:
         """Frames of windows, (n, length); the last one again after the end of an episode."""
