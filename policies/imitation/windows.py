@@ -154,7 +154,7 @@ class WindowPool:
                 reaches the eyes.
         """
         if anew and (not self._columns or len(self._columns[STATE]) != len(self._demonstrations)):
-            self._memory = None
+            self._sightings, self._memory = {}, None
             self._open(network)
         episodes = random.choice(len(weights), n, p=weights)
         # From a quarter of a window before the beginning, so that it is met often.

@@ -156,10 +156,13 @@ class Killed(BaseException):
     """What a kill looks like to the loop."""
 
 
-def test_a_run_killed_after_a_round_ends_like_one_that_was_left_alone(data, tmp_path):
+@pytest.mark.parametrize("without", [(), ("keypoints",)], ids=str)
+def test_a_run_killed_after_a_round_ends_like_one_that_was_left_alone(data, tmp_path, without):
     options = {
         "steps": 8,
-        "batch_size": 8,
+        "batch_size": 16,
+        "window_steps": 2,
+        "without": without,
         "checkpoint_period_s": 0.0,
         "dagger_rounds": 2,
         "dagger_frames": 20,
