@@ -1,6 +1,7 @@
 """``hvs demo``: the whole pipeline once, small enough to wait for."""
 
 import dataclasses
+import json
 import shutil
 from pathlib import Path
 
@@ -10,6 +11,9 @@ from hvs_suite.errors import OptionError, OutputError
 # Without disturbed episodes and starts near the goal, a policy never learns to correct itself.
 NOISE_RAD = 0.02
 PARTS = ("dataset", "policy", "results", "board", "episode.gif")
+STEPS_A_MINUTE = 250
+"""Fewer optimiser steps than this leave next to nothing learned in the demo's time; two cores that
+do nothing else make twice as many (docs/experiments/busy-machine.md)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -126,6 +130,25 @@ class Demo:
             ("episode", self.out / "episode.gif"),
         ):
             print(f"{what:<12}{path}")
+        outcome = json.loads((self.out / "policy/training/outcome.json").read_text())
+        if hint := busy(outcome["step"], self.minutes):
+            print(hint)
+
+
+def busy(steps: int, minutes: float) -> str:
+    """What to do about a training that got through little, in words; empty otherwise.
+
+    Args:
+        steps: Optimiser steps.
+        minutes: How long it learned (min).
+    """
+    if steps >= STEPS_A_MINUTE * minutes:
+        return ""
+    return (
+        f"The policy learned for {steps} steps only; two free cores make some "
+        f"{2 * STEPS_A_MINUTE * minutes:.0f} in that time. On a busy machine set "
+        "OMP_WAIT_POLICY=PASSIVE, or give it more --minutes."
+    )
 
 
 def _solved_scenario(result: Path) -> int:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from hvs_suite.cli.demo import busy
 from hvs_suite.cli.main import run
 from hvs_suite.eval.scoring import result_file
 
@@ -79,3 +80,9 @@ def test_demo_films_an_episode_with_both_cameras_beside_the_cell(demo):
 def test_demo_replaces_only_its_own_files(demo, capsys):
     assert run(["demo", "--out", str(demo)]) == 2
     assert "--overwrite" in capsys.readouterr().err
+
+
+def test_demo_says_what_to_do_where_it_could_hardly_learn():
+    assert busy(2269, minutes=4.0) == ""
+    assert "130 steps only" in busy(130, minutes=4.0)
+    assert "OMP_WAIT_POLICY=PASSIVE" in busy(130, minutes=4.0)
