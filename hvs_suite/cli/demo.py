@@ -12,8 +12,8 @@ from hvs_suite.errors import OptionError, OutputError
 NOISE_RAD = 0.02
 PARTS = ("dataset", "policy", "results", "board", "episode.gif")
 STEPS_A_MINUTE = 250
-"""Where fewer optimiser steps are made the demo says what to do; two cores that do nothing else make
-twice as many (docs/experiments/busy-machine.md)."""
+"""Where fewer optimiser steps are made the demo says what to do; two cores that do nothing else
+make twice as many (docs/experiments/busy-machine.md)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
