@@ -154,7 +154,7 @@ class Judged(pydantic.BaseModel):
             n_collision=summary.n_collision,
             steps_to_goal=summary.steps_to_goal_mean,
             settled=summary.settled.errors[name].iqm,
-            metric=f"{metric.title}, {metric.unit}",
+            metric=metric.label,
         )
 
 

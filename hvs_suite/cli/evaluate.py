@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from hvs_suite.eval.scoring.contender import Contender
     from hvs_suite.eval.scoring.result_file import Result
     from hvs_suite.eval.scoring.trial import Trial
-    from hvs_suite.tasks.shared.metric import Metric
 
 # The first few say what is wrong; a thousand of the same hide it.
 MAX_COMPLAINTS = 3
@@ -142,14 +141,14 @@ def _print_summary(result: "Result") -> None:
             ("steps to goal, mean", "-" if to_goal is None else f"{to_goal:.1f}"),
             *(
                 (
-                    f"{_title(metric)}: p50, p95",
+                    f"{metric.label}: p50, p95",
                     f"{errors[metric.name].p50:.3f}, {errors[metric.name].p95:.3f}",
                 )
                 for metric in spec.metrics
             ),
             *(
                 (
-                    f"settled {_title(metric)}: iqm, p99",
+                    f"settled {metric.label}: iqm, p99",
                     f"{settled.errors[metric.name].iqm:.3f}, {settled.errors[metric.name].p99:.3f}",
                 )
                 for metric in spec.metrics
@@ -164,7 +163,3 @@ def _print_summary(result: "Result") -> None:
         title=f"{summary.policy} on {summary.task}, split {summary.split}"
         + (f", with {listed(options)}: no score" if options else ""),
     )
-
-
-def _title(metric: "Metric") -> str:
-    return f"{metric.title}, {metric.unit}" if metric.unit else metric.title

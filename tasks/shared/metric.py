@@ -24,3 +24,8 @@ class Metric:
     bound: float | None = None
     over: Literal["step", "episode"] = "step"
     is_limit: bool = False
+
+    @property
+    def label(self) -> str:
+        """Title and unit, as a table's heading."""
+        return f"{self.title}, {self.unit}" if self.unit else self.title

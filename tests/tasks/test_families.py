@@ -11,6 +11,7 @@ from postures import goal_posture
 
 import hvs_suite
 from hvs_suite.errors import OptionError
+from hvs_suite.registry import find
 from hvs_suite.tasks.sequence import MISSED, Sequence
 from hvs_suite.tasks.shared.environment import Environment
 from hvs_suite.tasks.shared.family import register
@@ -71,6 +72,12 @@ def test_a_target_that_was_reached_vanishes_and_reaching_all_is_success(named: N
     assert (time_step.discount, time_step.reward) == (0.0, 1.0)
     assert env.info["is_success"]
     assert env.info["steps_to_goal"] == env.info["steps"] == 5
+
+
+def test_a_metric_is_said_with_its_unit_and_a_count_without() -> None:
+    labels = {metric.name: metric.label for metric in find("sequence-thesis").metrics}
+    assert labels[MISSED] == "targets missed"
+    assert labels["position_error_mm"] == "position error, mm"
 
 
 def test_a_miss_does_not_end_a_sequence_and_the_end_of_the_last_target_does() -> None:
