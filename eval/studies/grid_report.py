@@ -1,5 +1,6 @@
 """Table, words and picture of a study that a grid of cells makes."""
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -127,11 +128,17 @@ def draw(study: Study) -> Any:
         max(0.9 + 0.34 * len({row.name for row in rows}), 2.6 if group in followed else 0.0)
         for group, rows in groups.items()
     ]
-    n_columns = 2 if followed else 1
-    figure = Figure(figsize=(5.2 * n_columns + 2.4, sum(heights) + 0.3), layout="constrained")
+    # Many panels stand two abreast, so that a page shows them all.
+    abreast = 2 if len(groups) > 2 and not followed else 1
+    axes_each = 2 if followed else 1
+    row_heights = [max(some) for some in itertools.batched(heights, abreast)]
+    n_columns = abreast * axes_each
+    figure = Figure(figsize=(5.2 * n_columns + 2.4, sum(row_heights) + 0.3), layout="constrained")
     figure.set_dpi(130)
-    panels = figure.subplots(len(groups), n_columns, squeeze=False, height_ratios=heights)
-    for (axes, *beside), (group, rows) in zip(panels, groups.items(), strict=True):
+    panels = figure.subplots(
+        len(row_heights), n_columns, squeeze=False, height_ratios=row_heights
+    ).reshape(-1, axes_each)
+    for (axes, *beside), (group, rows) in zip(panels, groups.items(), strict=False):
         if len({row.scenes for row in rows}) > 1:
             _draw_map(axes, rows)
         else:
@@ -142,6 +149,8 @@ def draw(study: Study) -> Any:
                 _draw_curves(each, [row for row in rows if _points(row) > 1])
             else:
                 each.set_axis_off()
+    for [unused] in panels[len(groups) :]:
+        unused.set_axis_off()
     return figure
 
 

@@ -181,6 +181,18 @@ def test_tables_say_what_was_found():
     assert [label.get_text() for label in axes.get_yticklabels()] == ["alike", "worse", "whole"]
 
 
+def test_of_three_groups_and_more_two_stand_abreast():
+    whole = finished("whole", "11", against=None)
+    groups = ["a", "b", "c"]
+    study = Study(
+        name="s", question="?", finished=[whole.model_copy(update={"group": g}) for g in groups]
+    )
+    drawn = grid_report.draw(study).axes
+    assert [axes.get_title(loc="left") for axes in drawn] == [*groups, ""]
+    assert [axes.get_subplotspec().colspan.start for axes in drawn] == [0, 1, 0, 1]
+    assert [axes.axison for axes in drawn] == [True, True, True, False]
+
+
 def test_cells_that_play_several_scenes_make_a_map():
     cells = [finished("whole", "11", "10", against=None), finished("other", "00", "11")]
     study = Study(name="s", question="?", finished=cells)
