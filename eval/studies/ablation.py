@@ -4,8 +4,8 @@ Every policy of a task has the same data, seed and number of optimiser steps as 
 for the one thing that its cell names, and plays the same scenes. All begin with fresh eyes, so that
 those which learn without keypoints know of none.
 
-Budget: a cell on ``align-thesis`` with both cameras took 9 to 10 minutes on one core
-(docs/answers.md, D.1). At that rate the 42 cells take 7 hours on one core, 3.5 on two.
+Budget: the cells took 6 minutes (no eye to hand) to 40 (``surface-tilted``) on one core, as their
+``minutes`` in docs/experiments/ablation.json say: 42 cells 12 hours on one core, 6 on two.
 """
 
 from collections.abc import Mapping, Sequence
