@@ -4,8 +4,8 @@ Every policy of a task has the same data, seed and number of optimiser steps as 
 for the one thing that its cell names, and plays the same scenes. All begin with fresh eyes, so that
 those which learn without keypoints know of none.
 
-Budget: the cells took 6 minutes (no eye to hand) to 40 (``surface-tilted``) on one core, as their
-``minutes`` in docs/experiments/ablation.json say: 42 cells 12 hours on one core, 6 on two.
+Budget: the cells took 6 minutes (no eye to hand) to 51 (``surface-tilted``) on one core, as their
+``minutes`` in docs/experiments/ablation.json say: 42 cells 12.6 hours on one core, 6.3 on two.
 """
 
 from collections.abc import Mapping, Sequence
