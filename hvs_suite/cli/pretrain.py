@@ -45,10 +45,14 @@ class Pretrain(Players):
             find: checkpoint folders, or named tasks for the weights shipped for them. Each camera
             starts with those of the first that has it.
         kept_eyes: Cameras whose eyes stay as they were taken, joined by +.
+        weights: Policy to train on, whole: a checkpoint folder, or a named task for the weights
+            shipped for it. Give its --inputs, --slopes and --offsets again, and often a lower
+            --learning-rate.
         windows: Windows of control steps that belief and head learn from in a step.
         window_steps: Length of each.
         eye_share: Part of the training in which the eyes learn; in the rest belief and head do,
-            from what the eyes see. With 1 nothing but eyes comes out, for --eyes of another run.
+            from what the eyes see. With 1 nothing but eyes comes out, for --eyes of another run;
+            with 0 the eyes that it starts with learn nothing more.
         slopes: Cameras whose eyes tell the slope of the surface, joined by +; for surfaces that
             lean.
         offsets: Cameras whose pose is not exact, joined by +: the belief finds out how they are
@@ -74,6 +78,7 @@ class Pretrain(Players):
     error_scale: float | None = None
     eyes: tuple[str, ...] = ()
     kept_eyes: str | None = None
+    weights: str | None = None
     windows: int = 48
     window_steps: int = 16
     eye_share: float = 0.5
@@ -106,6 +111,7 @@ class Pretrain(Players):
                 episodes=self.episodes,
                 error_scale=self.error_scale,
                 eyes=[_folder(name) for name in self.eyes],
+                weights=None if self.weights is None else _folder(self.weights),
                 kept_eyes=() if self.kept_eyes is None else tuple(self.kept_eyes.split("+")),
                 windows=self.windows,
                 window_steps=self.window_steps,
@@ -136,12 +142,12 @@ class Pretrain(Players):
         print(f"wrote {self.out}")
 
 
-def _folder(eyes: str) -> Path:
-    """The checkpoint that eyes are taken from."""
+def _folder(name: str) -> Path:
+    """The checkpoint that a folder or a named task stands for."""
     from hvs_suite.policies.catalogue import checkpoint_folder
     from hvs_suite.registry import TASKS
 
-    return checkpoint_folder("pretrained", eyes) if eyes in TASKS else Path(eyes)
+    return checkpoint_folder("pretrained", name) if name in TASKS else Path(name)
 
 
 def _words(state: "Progress") -> str:

@@ -33,6 +33,7 @@ from hvs_suite.policies.imitation.settings import (
     new_policy,
     settings_for,
     take_eyes,
+    take_weights,
 )
 from hvs_suite.policies.imitation.state import Counters, load_state, save_state
 from hvs_suite.policies.imitation.teacher import Teacher, set_prior
@@ -110,6 +111,7 @@ def pretrain(
     minutes: float | None = None,
     steps: int | None = None,
     eyes: Sequence[Path] = (),
+    weights: Path | None = None,
     workers: Workers = 2,
     device: str = "cpu",
     checkpoint_period_s: float = 60.0,
@@ -125,6 +127,7 @@ def pretrain(
         minutes: Stop after this much training, decoding and DAgger rounds not counted (min).
         steps: Stop after this many optimiser steps. Give either, or both for the first reached.
         eyes: Checkpoints of policies to take the eyes of, see `take_eyes`; none for fresh ones.
+        weights: Checkpoint of a policy to go on with, see `take_weights`; None for a fresh one.
         workers: Processes that play the rounds, or others elsewhere; all give the same.
         device: Where the eyes learn, as torch calls it. Belief and head, whose steps are many and
             small, learn on the processor in any case.
@@ -140,7 +143,7 @@ def pretrain(
         OptionError: No budget, a number that makes no sense, or a device that is not there.
         OutputError: ``out`` cannot be written, its disk is full, or it holds something else than
             this run. With room again, the same command goes on from the last checkpoint.
-        PolicyError: The eyes do not fit.
+        PolicyError: The eyes or the weights do not fit.
         TrainingError: The loss is no longer a number.
     """
     budget = Budget(steps, minutes)
@@ -148,7 +151,7 @@ def pretrain(
     check_device(device)
     manifest = read_manifest(data)
     refuse_test_split(manifest)
-    chosen = settings_for(manifest, eyes, settings)
+    chosen = settings_for(manifest, eyes, weights, settings)
     cameras = [name for name in manifest.cameras if chosen.reads(name)]
     manifest = manifest.with_cameras(cameras, chosen.grey)
     prepare_process()
@@ -156,7 +159,10 @@ def pretrain(
     with claimed(out, identity):
         training = out / "training"
         policy = new_policy(manifest, chosen)
-        take_eyes(policy, eyes, chosen.kept_eyes)
+        if weights is None:
+            take_eyes(policy, eyes, chosen.kept_eyes)
+        else:
+            take_weights(policy, weights, chosen.kept_eyes)
         policy.network.eyes.to(device)
         write_train_config(
             out,

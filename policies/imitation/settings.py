@@ -53,10 +53,12 @@ class Settings:
         error_scale: See `HvsConfig`.
         eyes: SHA-256 of the weights whose eyes it begins with; none for fresh ones.
         kept_eyes: Cameras whose eyes stay as they were taken.
+        weights: SHA-256 of the weights that all of it begins with; None to begin afresh.
         windows: Windows of control steps a step that belief and head learn from.
         window_steps: Length of each.
         eye_share: Part of the training in which the eyes learn, the others from what they see in
-            the rest. With 1 there is nothing but eyes, for another run to begin with.
+            the rest. With 1 there is nothing but eyes, for another run to begin with; with 0 those
+            that it begins with learn nothing more.
         slopes: Cameras whose eyes tell the slope of the surface.
         offsets: Cameras whose pose is not exact: how they are shifted and turned is found out.
         without: What to leave out, of `PARTS`, to see what it is good for: ``memory`` of what was
@@ -78,6 +80,7 @@ class Settings:
     error_scale: float
     eyes: tuple[str, ...] = ()
     kept_eyes: tuple[str, ...] = ()
+    weights: str | None = None
     windows: int = 48
     window_steps: int = 16
     eye_share: float = 0.5
@@ -105,13 +108,17 @@ class Settings:
         cameras = [name for name in manifest.cameras if self.reads(name)]
         if unknown := sorted({*self.slopes, *self.offsets, *self.kept_eyes} - {*cameras}):
             raise OptionError(f"unknown camera {unknown[0]!r}; choose from {', '.join(cameras)}")
-        if {*self.kept_eyes} == {*cameras}:
-            raise OptionError("kept_eyes must leave a camera whose eye learns")
+        if {*self.kept_eyes} == {*cameras} and self.eye_share:
+            raise OptionError("kept_eyes must leave a camera whose eye learns, or eye_share be 0")
         for name in ("batch_size", "dagger_frames", "windows", "window_steps"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}")
-        if not 0.0 < self.eye_share <= 1.0:
-            raise OptionError(f"eye_share must be above 0 and at most 1, not {self.eye_share}")
+        if not 0.0 <= self.eye_share <= 1.0:
+            raise OptionError(f"eye_share must be from 0 to 1, not {self.eye_share}")
+        if self.eyes and self.weights:
+            raise OptionError("give --eyes or --weights, which have eyes as well; not both")
+        if not (self.eye_share or self.eyes or self.weights):
+            raise OptionError("fresh eyes must learn; give --eyes, --weights or an --eye-share")
         if self.eye_share == 1.0 and self.dagger_rounds:
             raise OptionError("eyes alone cannot play; leave --dagger-rounds out, or --eye-share")
         if not 0.0 < self.learning_rate < 1.0:
@@ -140,12 +147,18 @@ class Settings:
             raise OptionError(f"error_scale must be above 0, not {self.error_scale}")
 
 
-def settings_for(manifest: Manifest, eyes: Sequence[Path], chosen: Mapping[str, Any]) -> Settings:
+def settings_for(
+    manifest: Manifest,
+    eyes: Sequence[Path],
+    weights: Path | None,
+    chosen: Mapping[str, Any],
+) -> Settings:
     """The settings of a run on a dataset.
 
     Args:
         manifest: Of the dataset.
         eyes: Checkpoints of policies to take the eyes of; none for fresh ones.
+        weights: Checkpoint of the policy to go on with; None for a fresh one.
         chosen: Fields that differ from the defaults; ``error_scale`` is five times the task's
             tightest tolerance (m) where it is None.
 
@@ -161,6 +174,7 @@ def settings_for(manifest: Manifest, eyes: Sequence[Path], chosen: Mapping[str, 
         dataset=fingerprint(manifest.root),
         task=manifest.task,
         eyes=tuple(weights_digest(folder) for folder in eyes),
+        weights=None if weights is None else weights_digest(weights),
     )
     settings.check(manifest)
     return settings
@@ -264,6 +278,32 @@ def take_eyes(policy: "HvsPolicy", folders: Sequence[Path], kept: Collection[str
         raise PolicyError(f"no eyes were given for {missing[0]}, which is to keep them")
     for name in kept:
         eyes[name].requires_grad_(False)
+
+
+def take_weights(policy: "HvsPolicy", folder: Path, kept: Collection[str] = ()) -> None:
+    """Begin with another policy, whole.
+
+    Args:
+        policy: Whose network to replace.
+        folder: Checkpoint of an `hvs` policy.
+        kept: Cameras whose eyes are to learn no more.
+
+    Raises:
+        PolicyError: It is none, or its layers are others.
+    """
+    network = policy.network
+    mine, theirs = network.state_dict(), load_network(folder).state_dict()
+    odd = sorted(name for name in mine.keys() ^ theirs.keys())
+    odd += [name for name in mine if name in theirs and mine[name].shape != theirs[name].shape]
+    if odd:
+        raise PolicyError(
+            f"{folder} has other layers ({odd[0]}) than the policy that was asked for; "
+            "give the --inputs, --slopes and --offsets that it was trained with, and a dataset "
+            "whose images have the same sides"
+        )
+    network.load_state_dict(theirs)
+    for name in kept:
+        network.eyes[name].requires_grad_(False)
 
 
 def _fits(eye: nn.Module, other: nn.Module) -> bool:

@@ -132,6 +132,6 @@ def test_a_new_policy_has_it_where_the_targets_of_its_dataset_move(moves: bool) 
         column = {"dtype": "float32", "shape": [3], "names": ["x", "y", "z"]}
         features = {**manifest.features, GOAL_VELOCITY: column}
         manifest = dataclasses.replace(manifest, features=features)
-    policy = new_policy(manifest, settings_for(manifest, [], {"error_scale": None}))
+    policy = new_policy(manifest, settings_for(manifest, [], None, {"error_scale": None}))
     assert policy.config.foresight == (PAST_STEPS if moves else 0)
     assert (policy.network.foresight is not None) == moves

@@ -292,6 +292,26 @@ def test_an_eye_that_is_kept_learns_no_more_and_the_others_do(dataset, tmp_path)
         pretrain(dataset, tmp_path / "eye", steps=1, eyes=[learned], kept_eyes=("eye",))
 
 
+def test_a_policy_can_be_trained_on_whole_and_its_eyes_be_left_alone(dataset, tmp_path):
+    learned, out = tmp_path / "learned", tmp_path / "run"
+    pretrain(dataset, learned, steps=2, batch_size=4, slopes=("eih",))
+    alone = {"weights": learned, "slopes": ("eih",), "kept_eyes": ("eih", "eth"), "eye_share": 0.0}
+    pretrain(dataset, out, steps=2, seed=1, **alone)
+    before, after = weights(learned), weights(out)
+    changed = {name for name in after if not torch.equal(after[name], before[name])}
+    assert changed
+    assert not any(".eyes." in name for name in changed)
+    pretrain(dataset, tmp_path / "same", steps=1, learning_rate=1e-9, **alone)
+    for name, value in weights(tmp_path / "same").items():
+        torch.testing.assert_close(value, before[name], atol=1e-6, rtol=0)
+    with pytest.raises(PolicyError, match=r"other layers .* give the --inputs, --slopes"):
+        pretrain(dataset, tmp_path / "level", steps=1, weights=learned)
+    with pytest.raises(OptionError, match="give --eyes or --weights"):
+        pretrain(dataset, tmp_path / "both", steps=1, weights=learned, eyes=[learned])
+    with pytest.raises(OptionError, match="fresh eyes must learn"):
+        pretrain(dataset, tmp_path / "fresh", steps=1, eye_share=0.0)
+
+
 def test_data_recorded_on_the_test_split_is_refused(tmp_path):
     root = tmp_path / "data"
     miniature.write_dataset(root, miniature.scene(4), miniature.episodes(4), split="test")
