@@ -159,10 +159,12 @@ def pretrain(
     with claimed(out, identity):
         training = out / "training"
         policy = new_policy(manifest, chosen)
+        # What tells slopes learns apart from the eyes' share, so it has to be kept as well.
+        kept = chosen.kept_eyes if chosen.eye_share else cameras
         if weights is None:
-            take_eyes(policy, eyes, chosen.kept_eyes)
+            take_eyes(policy, eyes, kept)
         else:
-            take_weights(policy, weights, chosen.kept_eyes)
+            take_weights(policy, weights, kept)
         policy.network.eyes.to(device)
         write_train_config(
             out,

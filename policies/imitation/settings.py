@@ -108,8 +108,8 @@ class Settings:
         cameras = [name for name in manifest.cameras if self.reads(name)]
         if unknown := sorted({*self.slopes, *self.offsets, *self.kept_eyes} - {*cameras}):
             raise OptionError(f"unknown camera {unknown[0]!r}; choose from {', '.join(cameras)}")
-        if {*self.kept_eyes} == {*cameras} and self.eye_share:
-            raise OptionError("kept_eyes must leave a camera whose eye learns, or eye_share be 0")
+        if {*self.kept_eyes} == {*cameras}:
+            raise OptionError("kept_eyes must leave a camera whose eye learns")
         for name in ("batch_size", "dagger_frames", "windows", "window_steps"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}")
@@ -281,7 +281,7 @@ def take_eyes(policy: "HvsPolicy", folders: Sequence[Path], kept: Collection[str
 
 
 def take_weights(policy: "HvsPolicy", folder: Path, kept: Collection[str] = ()) -> None:
-    """Begin with another policy, whole.
+    """Begin with another policy, whole, but for its prior: that is the one of the dataset.
 
     Args:
         policy: Whose network to replace.
@@ -293,7 +293,7 @@ def take_weights(policy: "HvsPolicy", folder: Path, kept: Collection[str] = ()) 
     """
     network = policy.network
     mine, theirs = network.state_dict(), load_network(folder).state_dict()
-    odd = sorted(name for name in mine.keys() ^ theirs.keys())
+    odd = sorted(mine.keys() ^ theirs.keys())
     odd += [name for name in mine if name in theirs and mine[name].shape != theirs[name].shape]
     if odd:
         raise PolicyError(

@@ -295,7 +295,7 @@ def test_an_eye_that_is_kept_learns_no_more_and_the_others_do(dataset, tmp_path)
 def test_a_policy_can_be_trained_on_whole_and_its_eyes_be_left_alone(dataset, tmp_path):
     learned, out = tmp_path / "learned", tmp_path / "run"
     pretrain(dataset, learned, steps=2, batch_size=4, slopes=("eih",))
-    alone = {"weights": learned, "slopes": ("eih",), "kept_eyes": ("eih", "eth"), "eye_share": 0.0}
+    alone = {"weights": learned, "slopes": ("eih",), "eye_share": 0.0}
     pretrain(dataset, out, steps=2, seed=1, **alone)
     before, after = weights(learned), weights(out)
     changed = {name for name in after if not torch.equal(after[name], before[name])}
