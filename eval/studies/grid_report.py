@@ -84,7 +84,7 @@ def _mean(values: Sequence[float | None], digits: int) -> str:
 def _words(rows: Sequence[Row]) -> list[str]:
     """What the table says, one sentence for each thing that is compared."""
     most = max(row.rate for row in rows)
-    best = "; ".join(_name(row, rows) for row in rows if row.rate == most)
+    best = _names([row for row in rows if row.rate == most], rows)
     lines = [f"- Most scenes are solved by {best}: {most:.1f} %." if most else "- None is solved."]
     tested = [row for row in rows if row.p is not None]
     for against in dict.fromkeys(row.cell[0].against for row in tested):
@@ -99,14 +99,18 @@ def _words(rows: Sequence[Row]) -> list[str]:
             ),
         ):
             if some:
-                names = "; ".join(_name(row, rows) for row in some)
-                lines.append(f"- Compared with {against}, {words}: {names}.")
+                lines.append(f"- Compared with {against}, {words}: {_names(some, rows)}.")
     return lines
 
 
-def _name(row: Row, rows: Sequence[Row]) -> str:
-    several = len({each.scenes for each in rows}) > 1
-    return f"{row.name} (played {row.scenes})" if several else row.name
+def _names(some: Sequence[Row], rows: Sequence[Row]) -> str:
+    """Names of some rows of a table, each cell once."""
+    if len({row.scenes for row in rows}) == 1:
+        return "; ".join(row.name for row in some)
+    played: dict[str, list[str]] = {}
+    for row in some:
+        played.setdefault(row.name, []).append(row.scenes)
+    return "; ".join(f"{name} (played {' and '.join(each)})" for name, each in played.items())
 
 
 def draw(study: Study) -> Any:

@@ -17,7 +17,7 @@ from hvs_suite.eval.studies.training import Scenes
 from hvs_suite.eval.studies.ways import TRIAL, Effort, imitation
 
 TASK = "align-hard"
-EFFORT = Effort(demonstrations=600, steps=5000, dagger_rounds=2)
+EFFORT = Effort(demonstrations=400, steps=3000, dagger_rounds=2)
 NONE, ALL = "nothing", "everything"
 DISTURBANCES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {

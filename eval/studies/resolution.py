@@ -1,24 +1,71 @@
 """Thesis, D.2: how small the picture of each camera may be, and whether it needs colour.
 
-Budget: on one core 4,000 optimiser steps on ``align-thesis`` took 9 minutes (metadata of the
-shipped weights' result), nearly all of it the eyes at 112 px. The time of an eye grows with its
-pixels, so the cells take 5 to 20 minutes on ``align-thesis`` and 8 to 30 on ``surface-tilted``,
-whose episodes are longer: the 18 cells with two seeds about 10 hours on one core, 5 on two.
+Budget: a cell of ``align-thesis`` took 12 to 21 minutes on one core (docs/answers.md), the whole
+policy of ``surface-tilted`` 40 (docs/experiments/ablation.json), most of it for the 336 pixels of
+its eye to hand. So that task has fewer cells, and two seeds of all take 12 hours on one core, 6 on
+two.
 """
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 from hvs_suite.eval.studies.grid import Cell, Plan
 from hvs_suite.eval.studies.training import Scenes
 from hvs_suite.eval.studies.ways import TRIAL, Effort, imitation
 
-EFFORTS = {
-    "align-thesis": Effort(demonstrations=600, steps=3000, dagger_rounds=2),
-    "surface-tilted": Effort(demonstrations=400, steps=4000, dagger_rounds=2),
-}
 NAMES = {"eih": "eye in hand", "eth": "eye to hand"}
-WHOLE = "both 112 px, colour"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Pictures:
+    """What is tried on a task.
+
+    Attributes:
+        whole: Name of the cell with the task's own pictures.
+        effort: What each cell costs.
+        sides: Other sides of the picture of each camera (px).
+        grey: Cameras without colour, together; each a cell.
+        slopes: Cameras whose eyes tell the slope.
+    """
+
+    whole: str
+    effort: Effort
+    sides: Mapping[str, Sequence[int]]
+    grey: Sequence[tuple[str, ...]]
+    slopes: tuple[str, ...] = ()
+
+    def settings(self) -> dict[str, tuple[dict[str, Any], dict[str, Any]]]:
+        """Task options and settings of the learner, by cell."""
+        learning = {"slopes": self.slopes} if self.slopes else {}
+        cells: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {self.whole: ({}, learning)}
+        for camera, sides in self.sides.items():
+            for side in sides:
+                cells[f"{NAMES[camera]} {side} px"] = ({f"{camera}_resolution": side}, learning)
+        for cameras in self.grey:
+            name = NAMES[cameras[0]] if len(cameras) == 1 else "both"
+            cells[f"{name} grey"] = ({}, {"grey": cameras, **learning})
+        return cells
+
+
+TASKS: Mapping[str, Pictures] = MappingProxyType(
+    {
+        "align-thesis": Pictures(
+            whole="both 112 px, colour",
+            effort=Effort(demonstrations=600, steps=3000, dagger_rounds=2),
+            sides={"eih": (28, 56, 224), "eth": (28, 56, 224)},
+            grey=(("eih",), ("eth",), ("eih", "eth")),
+        ),
+        "surface-tilted": Pictures(
+            whole="eye in hand 112 px, eye to hand 336 px, colour",
+            effort=Effort(demonstrations=400, steps=4000, dagger_rounds=2),
+            sides={"eih": (56, 224), "eth": (112, 168)},
+            grey=(("eih", "eth"),),
+            slopes=("eih",),
+        ),
+    }
+)
 
 
 def plan(*, quick: bool = False) -> Plan:
@@ -27,23 +74,16 @@ def plan(*, quick: bool = False) -> Plan:
     Args:
         quick: Make everything in minutes, of next to no training.
     """
-    settings: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {WHOLE: ({}, {})}
-    for camera, name in NAMES.items():
-        for side in (28, 56, 224):
-            settings[f"{name} {side} px"] = ({f"{camera}_resolution": side}, {})
-    for camera, name in NAMES.items():
-        settings[f"{name} grey"] = ({}, {"grey": (camera,)})
-    settings["both grey"] = ({}, {"grey": tuple(NAMES)})
     cells = [
         Cell(
             group=task,
             name=name,
-            way=imitation(task, TRIAL if quick else effort, options, **learning),
+            way=imitation(task, TRIAL if quick else pictures.effort, options, **learning),
             on=[Scenes(task=task, options=options | _in_grey(learning.get("grey", ())))],
-            against=None if name == WHOLE else WHOLE,
+            against=None if name == pictures.whole else pictures.whole,
         )
-        for task, effort in EFFORTS.items()
-        for name, (options, learning) in settings.items()
+        for task, pictures in TASKS.items()
+        for name, (options, learning) in pictures.settings().items()
     ]
     return Plan(
         name="resolution",

@@ -198,6 +198,7 @@ def test_cells_that_play_several_scenes_make_a_map():
     study = Study(name="s", question="?", finished=cells)
     text = grid_report.markdown(study)
     assert "| other | test 1 | 100.0 % |" in text
+    assert "tell: other (played test 0 and test 1)." in text
     # There is one seed, and all are compared with the same.
     assert "each seed" not in text
     assert "compared with" not in text
