@@ -57,7 +57,7 @@ TASKS: Mapping[str, Pictures] = MappingProxyType(
             grey=(("eih",), ("eth",), ("eih", "eth")),
         ),
         "surface-tilted": Pictures(
-            whole="eye in hand 112 px, eye to hand 336 px, colour",
+            whole="112 and 336 px, colour",
             effort=Effort(demonstrations=400, steps=4000, dagger_rounds=2),
             sides={"eih": (56, 224), "eth": (112, 168)},
             grey=(("eih", "eth"),),
