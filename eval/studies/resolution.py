@@ -59,10 +59,10 @@ TASKS: Mapping[str, Pictures] = MappingProxyType(
             grey=(("eih",), ("eth",), ("eih", "eth")),
         ),
         # Eyes that learn slopes from nothing do it well or badly by chance
-        # (docs/experiments/fresh-slopes.md), so the eye in the hand begins with one that tells
-        # them, and sees pictures of its size. The weights of surface-tilted itself tell slopes in
-        # a way that no training takes over any more. Of the eyes to hand that of 336 px alone has
-        # the layers to begin with the other's.
+        # (docs/experiments/fresh-slopes.md), so the eye in the hand begins with that of
+        # surface-hard, whose pictures have the same side. (That of surface-tilted tells slopes in
+        # a way that no training takes over any more.) The eye to hand of 336 px begins with the
+        # other's too; the smaller ones and the grey one have other layers and begin afresh.
         "surface-tilted": Pictures(
             whole="eye to hand 336 px, colour",
             effort=Effort(demonstrations=300, steps=2000, dagger_rounds=2),
