@@ -74,7 +74,7 @@ def plan(
                 f"demonstrations must be 2 to the dataset's {manifest.n_episodes}, not {count}"
             )
     task, on = manifest.task, [Scenes(task=manifest.task)]
-    few = min(EVAL_EPISODES, episodes)
+    few, evaluations = min(EVAL_EPISODES, episodes), 1 if quick else EVALUATIONS
     cells = []
     for count in demonstrations:
         base = Imitation(
@@ -88,7 +88,7 @@ def plan(
                     task=task,
                     steps=env_steps,
                     settings={"reach_m": reach_m},
-                    evaluations=EVALUATIONS,
+                    evaluations=evaluations,
                     eval_episodes=few,
                 ),
                 BASE,
@@ -111,7 +111,7 @@ def plan(
             Cell(group=f"{task}, {count} demonstrations", name=name, way=way, on=on, against=other)
             for name, (way, other) in ways.items()
         ]
-    scratch = Scratch(task=task, steps=env_steps, evaluations=EVALUATIONS, eval_episodes=few)
+    scratch = Scratch(task=task, steps=env_steps, evaluations=evaluations, eval_episodes=few)
     cells.append(Cell(group=f"{task}, no demonstrations", name=SCRATCH, way=scratch, on=on))
     return Plan(
         name="few-demonstrations",

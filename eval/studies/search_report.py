@@ -12,17 +12,13 @@ SHOWN = 10
 
 def markdown(search: Search) -> str:
     """Tables and words of all trials so far."""
-    names = list(search.trials[0].settings)
-    ranked = sorted(search.trials, key=lambda each: -each.n_success)
-    best = ranked[0]
+    best = _ranked(search)[0]
     low, high = wilson_interval(best.n_success, best.n)
     lines = [
         f"`{search.task}`, {search.learner}: {len(search.trials)} trials, {best.n} scenes of split "
-        f"`{SPLIT}` each, the best {min(SHOWN, len(ranked))} of them.",
+        f"`{SPLIT}` each, the best {min(SHOWN, len(search.trials))} of them.",
         "",
-        f"| trial | {' | '.join(names)} | solved | 95 % interval (Wilson) |",
-        f"|---|{'---|' * len(names)}---|---|",
-        *(_line(each, names) for each in ranked[:SHOWN]),
+        *trial_table(search),
         "",
         f"- The best is trial {best.number}: {_rate(best):.1f} % ({low:.1f} to {high:.1f} %). As "
         "the best of many it owes something to chance; score it on other scenes."
@@ -32,14 +28,35 @@ def markdown(search: Search) -> str:
     if search.importances:
         lines += [
             "",
-            "| setting | importance |",
-            "|---|---|",
-            *(f"| {name} | {share:.2f} |" for name, share in search.importances.items()),
+            *importance_table(search),
             "",
             f"- What mattered most is {next(iter(search.importances))}.",
         ]
     lines += ["", "The commands that make each policy again are in study.json."]
     return "\n".join(lines) + "\n"
+
+
+def trial_table(search: Search) -> list[str]:
+    """The best trials in Markdown, line by line."""
+    names = list(search.trials[0].settings)
+    return [
+        f"| trial | {' | '.join(names)} | solved | 95 % interval (Wilson) |",
+        f"|---|{'---|' * len(names)}---|---|",
+        *(_line(each, names) for each in _ranked(search)[:SHOWN]),
+    ]
+
+
+def importance_table(search: Search) -> list[str]:
+    """What each setting had to do with success, in Markdown, line by line."""
+    return [
+        "| setting | importance |",
+        "|---|---|",
+        *(f"| {name} | {share:.2f} |" for name, share in search.importances.items()),
+    ]
+
+
+def _ranked(search: Search) -> list[Tried]:
+    return sorted(search.trials, key=lambda each: -each.n_success)
 
 
 def _line(trial: Tried, names: list[str]) -> str:
