@@ -1,8 +1,7 @@
 """Thesis, D.2: how small the picture of each camera may be, and whether it needs colour.
 
 Budget: a cell of ``align-thesis`` took 12 to 21 minutes on one core (docs/answers.md), one of
-``surface-tilted`` whose eyes learned slopes from nothing 42 to 50, about half of that for slopes
-(docs/experiments/fresh-slopes.md). So one seed of all takes at most 6 hours on one core, 3 on two.
+``surface-tilted`` 37 to 47, so one seed of all 6 hours on one core, 3 on two.
 """
 
 import dataclasses
@@ -58,7 +57,7 @@ TASKS: Mapping[str, Pictures] = MappingProxyType(
             sides={"eih": (28, 56, 224), "eth": (28, 56, 224)},
             grey=(("eih",), ("eth",), ("eih", "eth")),
         ),
-        # Eyes that learn slopes from nothing do it well or badly by chance
+        # What learns slopes from nothing does well or badly by chance
         # (docs/experiments/fresh-slopes.md), so the eye in the hand begins with that of
         # surface-hard, whose pictures have the same side. (That of surface-tilted tells slopes in
         # a way that no training takes over any more.) The eye to hand of 336 px begins with the
