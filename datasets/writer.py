@@ -414,8 +414,15 @@ def _episode_files(root: Path) -> list[str]:
 
 
 def _drop_unpublished(root: Path) -> None:
-    """Removes files of a block that was being moved into place when its recorder was killed."""
-    if not (root / files.INFO).exists():
+    """Removes files of a block that was being moved into place when its recorder was killed.
+
+    Raises:
+        DatasetError: What is there is damaged, and nothing is removed.
+    """
+    info = root / files.INFO
+    if info.parent.exists() and not info.parent.is_dir():
+        raise reader.DamagedFileError(info.parent.name, "is not a folder; record the dataset again")
+    if not info.exists():
         shutil.rmtree(root / "data", ignore_errors=True)
         shutil.rmtree(root / "meta", ignore_errors=True)
         return
