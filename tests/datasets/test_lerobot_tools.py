@@ -73,6 +73,7 @@ def test_dataset_viz_writes_an_episode(tmp_path):
     assert recording.stat().st_size > 50_000
 
 
+@pytest.mark.slow
 def test_what_edit_dataset_splits_merges_and_trims_stays_a_dataset_of_ours(tmp_path):
     edit = ("lerobot-edit-dataset", "--repo_id", "local/sample", "--root", SAMPLE)
     done = call(tmp_path, *edit, "--operation.type", "info")
@@ -105,6 +106,7 @@ def test_what_edit_dataset_splits_merges_and_trims_stays_a_dataset_of_ours(tmp_p
     assert run(["share", str(trimmed), "--to-archive", str(tmp_path / "t.tar")]) == 0
 
 
+@pytest.mark.slow
 def test_act_trains_for_a_few_steps_and_is_scored(tmp_path):
     done = call(
         tmp_path, "lerobot-train", "--dataset.repo_id=local/sample", f"--dataset.root={SAMPLE}",

@@ -112,6 +112,7 @@ def looked(uv: Tensor, size: Tensor) -> Tensor:
     return sightings
 
 
+@pytest.mark.slow
 def test_slopes_are_learned_from_all_frames_that_show_the_target(
     network: BeliefNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -67,6 +67,7 @@ def assert_same_weights(one: Path, other: Path) -> None:
         np.testing.assert_array_equal(value, others[name], err_msg=name)
 
 
+@pytest.mark.slow
 def test_an_evaluation_survives_the_death_of_its_driver_and_of_a_host(
     hosts: Hosts, tmp_path: Path
 ) -> None:
