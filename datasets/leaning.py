@@ -99,9 +99,10 @@ class Straightening:
     def next_place(self, goal: Goal, tip: Tip, q: FloatArray, steps_left: int) -> tuple[Goal, bool]:
         """Where to go next on the way down; see `Spiral.next_place`.
 
-        It leans away from the base, in the plane of a plain posture. A side that depended on where
-        the arm came from would depend on how the surface slopes, which is not seen before. And
-        leaning to the base the wrist is nearly straight, where a little of slope turns it by much.
+        It leans away from the base, in the plane in which the pitch joints turn. A side that
+        depended on where the arm came from would depend on how the surface slopes, which is not
+        seen before. And leaning to the base the wrist is nearly straight, where a little of slope
+        turns it by much.
         """
         left_m = _left_m(goal, tip)
         share = min(max((steps_left - self.upright_steps) / self.up_steps, 0.0), 1.0)

@@ -16,8 +16,8 @@ A target that is suddenly elsewhere counts as a new one that has not been seen. 
 both cameras have seen, more is known of how the eye-to-hand camera is shifted and turned: over the
 second target the demonstrator looks from lower, and to those that follow it goes straight.
 
-It goes there in one of two plain postures (see `hvs_suite.datasets.planner.Planner`), the very
-ones that the policy's head is shown.
+It goes there in a plain posture, by the rule by which the policy's head is shown one (see
+`hvs_suite.cell.plain_postures`).
 
 Over a surface of unknown slope it goes around, or leans, on its way down, so that the eye in the
 hand sees the slope (see `hvs_suite.datasets.leaning`).

@@ -24,7 +24,8 @@ import numpy.typing as npt
 import ruckig
 
 from hvs_suite.cell import robot
-from hvs_suite.cell.kinematics import Kinematics, away_from_stops, kinematics
+from hvs_suite.cell.kinematics import Kinematics, away_from_stops, circle, kinematics
+from hvs_suite.cell.plain_postures import CHOSEN_ABOVE_M, ELBOWS_RAD, soonest_first
 from hvs_suite.cell.solid import Solid, obstacle_distance
 from hvs_suite.datasets.roadmap import Roadmap
 from hvs_suite.embodiment import BARE_ARM, Embodiment
@@ -54,9 +55,6 @@ _CROWDED_SHARE = 0.5
 _ROOM_S = 1.5
 """Where more goals follow, what a joint at its stop costs (s), against the way back from there; a
 joint within `_CROWDED_SHARE` of its range costs nothing, between the price goes with the square."""
-
-PLAIN_SWIVELS = 1
-"""The elbow straight above: two postures within reach, as a rule."""
 
 _FULL_SPEED: FloatArray = robot.JOINT_SPEED_RAD_S[:6, None]
 _MAX_PATHS = 24
@@ -136,12 +134,9 @@ class Planner:
 
     Args:
         period_s: Control period (s).
-        plain: Go to the goal in one of two postures, the elbow straight above the line from
-            shoulder to wrist, A1 towards the target or away from it: the one whose slowest joint
-            arrives first at full speed. Which of some two thousand postures is reached soonest
-            changes with every small change of the arm's position, and a network cannot learn that;
-            it can learn the choice between two (docs/experiments/simple-ways.md). They cost three
-            steps.
+        plain: Go to the goal in one of few postures, by a rule that a policy can learn
+            (`hvs_suite.cell.plain_postures`). From random starts this costs half a step to two a
+            target (docs/experiments/elbow-aside.md).
         embodiment: The robot, whose tip is what goals are for.
         clearance_m: What a motion keeps from surface, self and obstacles (m) where it can; where it
             cannot, `CLEARANCE_M`.
@@ -160,10 +155,12 @@ class Planner:
         self._lead_s = LEAD_S * embodiment.slowness
         self._plain = plain
         self._wanted_m = clearance_m
-        self._n_swivel = PLAIN_SWIVELS if plain else N_SWIVEL
+        self._swivels = np.array(ELBOWS_RAD) if plain else circle(N_SWIVEL)
         self._goal_key: bytes = b""
         self._family: FloatArray = np.empty((7, 1))
         """The goal's configurations, one a column; the last is kept free."""
+        self._chosen_by: FloatArray = np.empty((0, 7))
+        """For plain postures: where the arm would have to come soonest, one a row."""
         self._more_follow = False
         self._floor_m = 0.0
         self._clearance_m = 0.0
@@ -195,7 +192,7 @@ class Planner:
             velocity: Joint velocities now, (7,) rad/s.
             goal: Where the flange has to be.
             onward: Where it goes next, if the goal is only on the way: postures from which that
-                takes long are left out.
+                takes long are left out, unless they are plain.
 
         Returns:
             (7,) rad; `q` where the goal is out of reach.
@@ -204,7 +201,7 @@ class Planner:
         self._remember_goal(goal)
         self._more_follow = goal.more_follow
         family = self._reachable(q, velocity, goal)
-        if onward is not None:
+        if onward is not None and not self._plain:
             family = self._with_short_way_on(family, onward)
         if len(family) == 0:
             return q
@@ -303,12 +300,12 @@ class Planner:
         well below their speeds. A7 is left out, because yaw is free. Where the path leaves the
         reach it ends.
         """
-        n_swivel = min(self._n_swivel, _FORESIGHT_SWIVELS)
-        lasts: BoolArray = np.ones(8 * n_swivel, bool)
+        swivels = self._swivels if self._plain else circle(_FORESIGHT_SWIVELS)
+        lasts: BoolArray = np.ones(8 * len(swivels), bool)
         fastest = _SPEED_SHARE * _FORESIGHT_STEP_S * robot.JOINT_SPEED_RAD_S[:6]
         before: FloatArray | None = None
         for goal in path:
-            shapes = self._kinematics.goal_shapes(goal.position, goal.normal, n_swivel)[:, :6]
+            shapes = self._kinematics.goal_shapes(goal.position, goal.normal, swivels)[:, :6]
             if len(shapes) == 0:
                 break
             lasts &= (np.abs(shapes) <= _FREE_RANGE_RAD).all(axis=1)
@@ -316,7 +313,7 @@ class Planner:
                 lasts &= (np.abs(shapes - before) <= fastest).all(axis=1)
             before = shapes
         # What holds for an elbow place holds for those within a few degrees of it.
-        return lasts.repeat(self._n_swivel // n_swivel)
+        return lasts.repeat(len(self._swivels) // len(swivels))
 
     def _look_around(self, q: FloatArray, goal: Goal) -> None:
         """Take in how far the arm is from what it must not touch."""
@@ -364,15 +361,17 @@ class Planner:
             return
         self._goal_key = key
         self._soonest_s = math.inf
-        family: FloatArray = np.empty((0, 7))
-        if among is not None:
-            shapes = self._kinematics.goal_shapes(goal.position, goal.normal, self._n_swivel)
-            family = shapes[among] if len(shapes) else shapes
-            family = family[(np.abs(family[:, :6]) <= robot.JOINT_RANGE_RAD[:6]).all(axis=1)]
-        if len(family) == 0:
-            family = self._kinematics.goal_configurations_at_tool_angle(
-                goal.position, goal.normal, tool_angle=0.0, n_swivel=self._n_swivel
-            )
+        shapes = self._kinematics.goal_shapes(goal.position, goal.normal, self._swivels)
+        usable, chosen_by = _within_ranges(shapes), shapes
+        if self._plain:
+            over = goal.target + CHOSEN_ABOVE_M * goal.normal
+            above = self._kinematics.goal_shapes(over, goal.normal, self._swivels)
+            if len(above) == len(shapes) and (usable & _within_ranges(above)).any():
+                usable, chosen_by = usable & _within_ranges(above), above
+        if among is not None and len(shapes) and (usable & among).any():
+            usable = usable & among
+        self._chosen_by = chosen_by[usable]
+        family = shapes[usable]
         self._family = np.empty((7, len(family) + 1))
         self._family[:, :-1] = family.T
 
@@ -402,8 +401,7 @@ class Planner:
         ago. Where that fails all are timed, so the answer does not depend on the last one.
         """
         if self._plain:
-            times = (np.abs(family - q) / robot.JOINT_SPEED_RAD_S)[:, :6].max(axis=1)
-            yield from family[np.argsort(times, kind="stable")]
+            yield from family[soonest_first(q, self._chosen_by)]
             return
         # Joint by joint along the first axis: NumPy is slow over rows of seven.
         joints = family[:, :6].T
@@ -493,8 +491,8 @@ class Planner:
         A7 alone turns the free yaw, so it is left where it comes to rest.
         """
         rest = self._where_braking_ends(q, velocity)
-        # Beside the two plain postures, the nearest would be another goal for every place that the
-        # arm comes from.
+        # Beside plain postures, the nearest would be another goal for every place from which the
+        # arm comes.
         nearest = None if self._plain else self._nearest_posture(rest, goal)
         family = self._family
         if nearest is None:
@@ -562,6 +560,11 @@ class Planner:
             clearance = self._clearance(q)
             least = min(least, clearance)
         return least
+
+
+def _within_ranges(postures: FloatArray) -> BoolArray:
+    """Which postures (m, 7) are within the joint ranges, A7 left out: (m,)."""
+    return np.asarray((np.abs(postures[:, :6]) <= robot.JOINT_RANGE_RAD[:6]).all(axis=1))
 
 
 def _crowding(postures: FloatArray) -> FloatArray:

@@ -30,26 +30,6 @@ _DRIFT_RANGE_RAD = np.radians(30.0)
 _DRIFT_RAD = 0.05
 _OFTEN_NEAREST = 4, 7
 """Links that come nearest to each other in most configurations: forearm and hand."""
-# A shape and its mirror image through each of the three pivots: adding pi to the two roll joints
-# beside a pivot and negating the pivot leaves the pose of everything else alone.
-_FLIP_SHOULDER = np.array([1, 0, 1, 0, 0, 0, 0], dtype=np.float64)
-_FLIP_ELBOW = np.array([0, 0, 1, 0, 1, 0, 0], dtype=np.float64)
-_FLIP_WRIST = np.array([0, 0, 0, 0, 1, 0, 1], dtype=np.float64)
-
-
-def _branches() -> tuple[FloatArray, FloatArray]:
-    """Shift (8, 7) in rad and sign (8, 7) that turn one shape into its eight mirror shapes."""
-    shifts, signs = [], []
-    for shoulder in (0, 1):
-        for elbow in (0, 1):
-            for wrist in (0, 1):
-                flips = shoulder * _FLIP_SHOULDER + elbow * _FLIP_ELBOW + wrist * _FLIP_WRIST
-                shifts.append(np.pi * flips)
-                signs.append([1, 1 - 2 * shoulder, 1, 1 - 2 * elbow, 1, 1 - 2 * wrist, 1])
-    return np.array(shifts), np.array(signs, dtype=np.float64)
-
-
-_BRANCH_SHIFT, _BRANCH_SIGN = _branches()
 
 
 def away_from_stops(q: FloatArray) -> FloatArray:
@@ -312,9 +292,9 @@ class Kinematics:
             np.atleast_1d(np.asarray(yaw, dtype=np.float64)),
             np.atleast_1d(np.asarray(swivel, dtype=np.float64)),
         )
-        q = self._shapes(position, normal, swivel)
+        q = self.goal_shapes(position, normal, swivel)
         if len(q):
-            q[:, 6] += np.tile(yaw, len(_BRANCH_SIGN))
+            q[:, 6] += np.tile(yaw, len(robot.MIRROR_SIGN))
         return _within_ranges(q)
 
     def goal_configurations(
@@ -338,10 +318,10 @@ class Kinematics:
         Returns:
             Configurations (m, 7) in rad within the joint ranges, m <= 8 n_yaw n_swivel.
         """
-        shapes = self._shapes(position, normal, _circle(n_swivel))
+        shapes = self.goal_shapes(position, normal, circle(n_swivel))
         shapes = shapes[(np.abs(shapes[:, :6]) <= robot.JOINT_RANGE_RAD[:6]).all(axis=1)]
         q = np.repeat(shapes, n_yaw, axis=0)
-        q[:, 6] = _wrap(q[:, 6] + np.tile(_circle(n_yaw), len(shapes)))
+        q[:, 6] = _wrap(q[:, 6] + np.tile(circle(n_yaw), len(shapes)))
         return np.asarray(q[np.abs(q[:, 6]) <= robot.JOINT_RANGE_RAD[6]])
 
     def goal_configurations_at_tool_angle(
@@ -364,62 +344,23 @@ class Kinematics:
         Returns:
             Configurations (m, 7) in rad within the joint ranges, m <= 8 n_swivel.
         """
-        q = self._shapes(position, normal, _circle(n_swivel))
+        q = self.goal_shapes(position, normal, circle(n_swivel))
         q[:, 6] = tool_angle
         return _within_ranges(q)
 
     def goal_shapes(
-        self, position: npt.ArrayLike, normal: npt.ArrayLike, n_swivel: int
+        self, position: npt.ArrayLike, normal: npt.ArrayLike, swivel: FloatArray
     ) -> FloatArray:
         """The family of a goal at yaw 0, row by row the same elbow places and shapes for any goal.
 
         Args:
             position: Of the tip (3,) in m.
             normal: Outward surface normal (3,).
-            n_swivel: Evenly spaced elbow places over the circle.
+            swivel: Angles of the elbow on its circle (n,) in rad, 0 at the highest point.
 
         Returns:
-            (8 n_swivel, 7) in rad, joint ranges not checked, angles within [-pi, pi); empty where
-            the goal is out of reach.
-        """
-        return self._shapes(position, normal, _circle(n_swivel))
-
-    def nearest_configuration(
-        self, q: FloatArray, position: FloatArray, normal: FloatArray, weight: FloatArray
-    ) -> FloatArray | None:
-        """The configuration of a goal that is nearest to joint angles, by Gauss-Newton.
-
-        Args:
-            q: Joint angles (7,) in rad, not far from the goal.
-            position: Of the tip (3,) in m.
-            normal: Outward surface normal (3,); yaw about it is free.
-            weight: How readily each joint turns (7,): distances are measured in q / weight.
-
-        Returns:
-            (7,) in rad, or None where the iteration ends outside the joint ranges or nowhere.
-        """
-        across = _across(normal.tobytes())
-        for _ in range(_ITERATIONS):
-            R, tip = self.tip_pose(q)
-            # Rotation vector that takes the flange axis onto the inward normal.
-            error = np.concatenate([position - tip, across @ _cross(R[:, 2], -normal)])
-            if np.abs(error).max() < 1e-9:
-                break
-            jacobian = self.jacobian(q)
-            weighted = np.concatenate([jacobian[:3], across @ jacobian[3:]]) * weight
-            q = q + weight * _least_solution(weighted, error)
-        else:
-            return None
-        if (np.abs(q) > robot.JOINT_RANGE_RAD).any() or R[:, 2] @ normal > 0.0:
-            return None
-        return np.asarray(q)
-
-    def _shapes(
-        self, position: npt.ArrayLike, normal: npt.ArrayLike, swivel: FloatArray
-    ) -> FloatArray:
-        """The eight shapes of each elbow place at yaw 0: (8 n, 7) in rad, ranges not checked.
-
-        Shape by shape, each for all swivels in order; empty where out of reach.
+            (8 n, 7) in rad, joint ranges not checked, angles within [-pi, pi); shape by shape, each
+            for all swivels in order; empty where the goal is out of reach.
         """
         R_goal = tool_frame(normal)
         wrist = np.asarray(position, dtype=np.float64) - self._wrist_to_tip_m * R_goal[:, 2]
@@ -451,8 +392,38 @@ class Kinematics:
         q[:, 0], q[:, 1], q[:, 2] = _zyz_angles(R_shoulder)
         q[:, 3] = elbow
         q[:, 4], q[:, 5], q[:, 6] = _zyz_angles(R_wrist)
-        shapes = _BRANCH_SIGN[:, None, :] * q + _BRANCH_SHIFT[:, None, :]
+        shapes = robot.MIRROR_SIGN[:, None, :] * q + robot.MIRROR_SHIFT_RAD[:, None, :]
         return _wrap(shapes.reshape(-1, 7))
+
+    def nearest_configuration(
+        self, q: FloatArray, position: FloatArray, normal: FloatArray, weight: FloatArray
+    ) -> FloatArray | None:
+        """The configuration of a goal that is nearest to joint angles, by Gauss-Newton.
+
+        Args:
+            q: Joint angles (7,) in rad, not far from the goal.
+            position: Of the tip (3,) in m.
+            normal: Outward surface normal (3,); yaw about it is free.
+            weight: How readily each joint turns (7,): distances are measured in q / weight.
+
+        Returns:
+            (7,) in rad, or None where the iteration ends outside the joint ranges or nowhere.
+        """
+        across = _across(normal.tobytes())
+        for _ in range(_ITERATIONS):
+            R, tip = self.tip_pose(q)
+            # Rotation vector that takes the flange axis onto the inward normal.
+            error = np.concatenate([position - tip, across @ _cross(R[:, 2], -normal)])
+            if np.abs(error).max() < 1e-9:
+                break
+            jacobian = self.jacobian(q)
+            weighted = np.concatenate([jacobian[:3], across @ jacobian[3:]]) * weight
+            q = q + weight * _least_solution(weighted, error)
+        else:
+            return None
+        if (np.abs(q) > robot.JOINT_RANGE_RAD).any() or R[:, 2] @ normal > 0.0:
+            return None
+        return np.asarray(q)
 
 
 @functools.lru_cache(maxsize=256)
@@ -474,7 +445,7 @@ def _cross(one: FloatArray, two: FloatArray) -> FloatArray:
     return np.array([b * z - c * y, c * x - a * z, a * y - b * x])
 
 
-def _circle(n: int) -> FloatArray:
+def circle(n: int) -> FloatArray:
     """Angles (n,) in rad, evenly spaced over the full circle from 0."""
     return np.arange(n, dtype=np.float64) * (2.0 * np.pi / n)
 

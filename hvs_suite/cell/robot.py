@@ -58,6 +58,28 @@ JOINT_HEIGHTS_M: tuple[float, ...] = (0.150, 0.340, 0.550, 0.740, 0.950, 1.140, 
 """Height of each link frame above the base at the zero pose; A2, A4, A6 are pivot centres."""
 FLANGE_HEIGHT_M = BASE_TO_SHOULDER_M + SHOULDER_TO_ELBOW_M + ELBOW_TO_WRIST_M + WRIST_TO_FLANGE_M
 
+# A shape and its mirror image through each of the three pivots: adding pi to the two roll joints
+# beside a pivot and negating the pivot leaves the pose of everything else alone.
+_FLIP_SHOULDER = np.array([1, 0, 1, 0, 0, 0, 0], dtype=np.float64)
+_FLIP_ELBOW = np.array([0, 0, 1, 0, 1, 0, 0], dtype=np.float64)
+_FLIP_WRIST = np.array([0, 0, 0, 0, 1, 0, 1], dtype=np.float64)
+
+
+def _mirrors() -> tuple[FloatArray, FloatArray]:
+    """Shift (8, 7) in rad and sign (8, 7) that turn one shape into its eight mirror shapes."""
+    shifts, signs = [], []
+    for shoulder in (0, 1):
+        for elbow in (0, 1):
+            for wrist in (0, 1):
+                flips = shoulder * _FLIP_SHOULDER + elbow * _FLIP_ELBOW + wrist * _FLIP_WRIST
+                shifts.append(np.pi * flips)
+                signs.append([1, 1 - 2 * shoulder, 1, 1 - 2 * elbow, 1, 1 - 2 * wrist, 1])
+    return np.array(shifts), np.array(signs, dtype=np.float64)
+
+
+MIRROR_SHIFT_RAD, MIRROR_SIGN = _mirrors()
+"""What makes the eight mirror shapes of one: its angles times the sign, plus the shift, (8, 7)."""
+
 PHYSICS_TIMESTEP_S = BARE_ARM.timestep_s
 """The timestep that the gains below are tuned for, with integrator ``implicitfast``."""
 ARMATURE_KG_M2 = 0.1

@@ -59,6 +59,9 @@ class Pretrain(Players):
             shifted and turned; for targets in sequence.
         without: Parts of the design to leave out, joined by +, to see what they are good for:
             memory of what was seen; keypoints, without which the eyes learn from goals and actions.
+        corrects_within_m: How far from the goal the head corrects the mean of the ways that it is
+            shown (m); beyond it does so less, and from twice as far on not at all. Everywhere by
+            default. For arms that stand still on long ways.
         batch_size: Frames that the eyes learn from in a step.
         device: Where the eyes learn: cpu or cuda. The rest learns on the processor.
         learning_rate: Peak of the schedule.
@@ -85,6 +88,7 @@ class Pretrain(Players):
     slopes: str | None = None
     offsets: str | None = None
     without: str | None = None
+    corrects_within_m: float | None = None
     batch_size: int = 64
     device: str = "cpu"
     learning_rate: float = 2e-3
@@ -119,6 +123,7 @@ class Pretrain(Players):
                 slopes=() if self.slopes is None else tuple(self.slopes.split("+")),
                 offsets=() if self.offsets is None else tuple(self.offsets.split("+")),
                 without=() if self.without is None else tuple(self.without.split("+")),
+                corrects_within_m=self.corrects_within_m,
                 batch_size=self.batch_size,
                 learning_rate=self.learning_rate,
                 workers=self.players(local=2),

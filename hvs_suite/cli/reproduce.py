@@ -37,7 +37,7 @@ class Reproduce:
         plan = recipe(self.task)
         episodes = self.episodes or EPISODES.get(self.task, TEST_SCENARIOS)
         stages = {"record": _going_on(plan.record)}
-        stages |= {f"eyes, {words[0]}": _going_on(words) for words in plan.eyes}
+        stages |= {f"{words[0]} {_out(words).name}": _going_on(words) for words in plan.earlier}
         results: dict[str, Path] = {}
         for name, train in (("pretrained", plan.pretrain), ("fine-tuned", plan.finetune)):
             if train is None:

@@ -4,15 +4,21 @@ Fixed and differentiable where it says so. Base frame, metres. The tool points a
 normal; turning about it is free. Nothing in here knows a task.
 """
 
+import math
+
 import torch
+import torch.nn.functional as F  # noqa: N812
 from torch import Tensor
 
+from hvs_suite.cell.plain_postures import EFFORT_S, ELBOWS_RAD
 from hvs_suite.cell.robot import (
     BASE_TO_SHOULDER_M,
     ELBOW_TO_WRIST_M,
     JOINT_ACCELERATION_RAD_S2,
     JOINT_RANGE_RAD,
     JOINT_SPEED_RAD_S,
+    MIRROR_SHIFT_RAD,
+    MIRROR_SIGN,
     SHOULDER_TO_ELBOW_M,
     WRIST_TO_FLANGE_M,
 )
@@ -93,7 +99,7 @@ def postures(flange: Tensor, normal: Tensor) -> Tensor:
     Shoulder, elbow and wrist stand in one upright plane, the elbow above: a planar arm of two
     links, by the law of cosines; A5 and A6 then turn the tool. A1 turns that plane towards the
     wrist, or away from it with all angles of the plane the other way round. Out of reach, the arm
-    is stretched that way.
+    is stretched that way. Weights that learned before the elbow could also be aside go by these.
 
     Args:
         flange: Where it should be, (B, 3) m. No gradient flows through it.
@@ -153,6 +159,92 @@ def way_to_posture(q: Tensor, flange: Tensor, normal: Tensor) -> tuple[Tensor, T
     nearer = torch.where(within, times, times + UNREACHABLE_S).argmin(dim=1)
     row = torch.arange(len(q), device=q.device)
     return ways[row, nearer], times[row, nearer, None], within[row, nearer, None].to(q)
+
+
+def postures_by_elbow(flange: Tensor, normal: Tensor) -> Tensor:
+    """The eight mirror shapes for each place of the elbow that plain postures have.
+
+    As `hvs_suite.cell.kinematics.Kinematics.goal_shapes`; out of reach, the arm is stretched that
+    way.
+
+    Args:
+        flange: Where it should be, (..., 3) m. No gradient flows through it.
+        normal: Unit normal that it should face, (..., 3). No gradient flows through it.
+
+    Returns:
+        Angles of A1 to A6, (..., 8 n, 6) rad in [-pi, pi), shape by shape; joint ranges are not
+        looked at.
+    """
+    with torch.no_grad():
+        upper, fore = SHOULDER_TO_ELBOW_M, ELBOW_TO_WRIST_M
+        wrist = flange + WRIST_TO_FLANGE_M * normal
+        line = wrist - wrist.new_tensor([0.0, 0.0, BASE_TO_SHOULDER_M])
+        far = line.norm(dim=-1, keepdim=True)
+        reach = far.clamp(max=upper + fore)
+        cos_4 = ((reach**2 - upper**2 - fore**2) / (2.0 * upper * fore)).clamp(-1.0, 1.0)
+        bend = torch.arccos(cos_4)
+        sin_4 = torch.sin(bend)
+        # The line from shoulder to wrist in the upper arm's frame, the elbow on its +x side.
+        along_x = (-fore * sin_4 / reach)[..., None]
+        along_z = ((upper + fore * cos_4) / reach)[..., None]
+        axis = line / far
+        up = F.normalize(axis.new_tensor([0.0, 0.0, 1.0]) - axis * axis[..., 2:], dim=-1)
+        side = torch.linalg.cross(axis, up, dim=-1)
+        axis, up, side = axis[..., None, :], up[..., None, :], side[..., None, :]
+        swivel = torch.tensor(ELBOWS_RAD).to(flange)[:, None]
+        to_elbow = torch.cos(swivel) * up + torch.sin(swivel) * side
+        y = torch.cos(swivel) * side - torch.sin(swivel) * up
+        # The upper arm's axes x, y and z in the base frame, (..., n, 3).
+        x = along_z * to_elbow + along_x * axis
+        z = along_z * axis - along_x * to_elbow
+        a1 = torch.atan2(z[..., 1], z[..., 0])
+        a2 = torch.atan2(torch.hypot(z[..., 0], z[..., 1]), z[..., 2])
+        a3 = torch.atan2(y[..., 2], -x[..., 2])
+        # The tool's axis in the forearm's frame.
+        cos_4, sin_4, tool = cos_4[..., None], sin_4[..., None], -normal[..., None, :]
+        tool_x = (tool * (cos_4 * x + sin_4 * z)).sum(dim=-1)
+        tool_y = (tool * y).sum(dim=-1)
+        tool_z = (tool * (cos_4 * z - sin_4 * x)).sum(dim=-1)
+        a5 = torch.atan2(tool_y, tool_x)
+        a6 = torch.atan2(torch.hypot(tool_x, tool_y), tool_z)
+        q = torch.stack([a1, a2, a3, bend.expand_as(a1), a5, a6], dim=-1)
+        sign, shift = (
+            torch.as_tensor(each[:, None, :-1]).to(q) for each in (MIRROR_SIGN, MIRROR_SHIFT_RAD)
+        )
+        q = (sign * q[..., None, :, :] + shift).flatten(-3, -2)
+        return torch.remainder(q + math.pi, 2.0 * math.pi) - math.pi
+
+
+def ways_to_posture(
+    q: Tensor, flange: Tensor, normal: Tensor, chosen: Tensor
+) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """The ways to places in the posture that `hvs_suite.cell.plain_postures` chooses for them all.
+
+    Args:
+        q: Joint angles, (B, 7) rad.
+        flange: Where it should be, (B, k, 3) m. No gradient flows through it.
+        normal: Unit normal that it should face, (B, 3). No gradient flows through it.
+        chosen: Where it would have to come soonest, (B, 3) m.
+
+    Returns:
+        For each place what `way_to_posture` returns. A posture that is beyond the joint ranges at
+        some of the places is chosen where there is no other.
+    """
+    speed = torch.as_tensor(JOINT_SPEED_RAD_S[:-1]).to(q)
+    limit = torch.as_tensor(JOINT_RANGE_RAD[:-1]).to(q)
+    places = torch.cat([chosen[:, None], flange], dim=1)
+    ends = postures_by_elbow(places, normal[:, None].expand_as(places))
+    within = (ends.abs() <= limit).all(dim=3)
+    turns_s = (ends[:, 0] - q[:, None, :-1]) / speed
+    price = turns_s.abs().amax(dim=2) + EFFORT_S * turns_s.square().sum(dim=2)
+    best = (price + UNREACHABLE_S * (~within).sum(dim=1)).argmin(dim=1)
+    row = torch.arange(len(q), device=q.device)
+    ways = []
+    for i in range(1, places.shape[1]):
+        turns = ends[row, i, best] - q[:, :-1]
+        time_s = (turns.abs() / speed).amax(dim=1, keepdim=True)
+        ways.append((turns, time_s, within[row, i, best, None].to(q)))
+    return ways
 
 
 def along_way(turns: Tensor, velocity: Tensor, time_s: float, *, together: bool = True) -> Tensor:

@@ -5,7 +5,7 @@ task is (where targets lie, how large they are, how far off the tool stays, what
 learns from demonstrations.
 
 The head thinks in the goal's frame first: a small network says to which point by the goal the tip
-should go next, damped least squares turn that into a joint step. The ways to two plain postures
+should go next, damped least squares turn that into a joint step. The ways to plain postures
 over the goal, and to one from which the cameras see more, are put beside it. A second network
 weighs them and corrects their mean, on a logarithmic scale on which a micrometre and a metre both
 teach something.
@@ -20,6 +20,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 from torch import Tensor, nn
 
+from hvs_suite.cell.plain_postures import CHOSEN_ABOVE_M
 from hvs_suite.cell.robot import JOINT_RANGE_RAD, JOINT_SPEED_RAD_S, LAG_S
 from hvs_suite.policies.belief import arm, geometry
 from hvs_suite.policies.belief.belief import (
@@ -133,6 +134,12 @@ class Shape:
             last.
         remembers: Whether it remembers what it has seen; without, each observation is like the
             first, but for where the arm has been sent.
+        corrects_within_m: How far from the believed goal the head corrects the mean of its
+            proposals (m); beyond it does so less, and from twice as far on not at all. None where
+            it does so everywhere: what it has learned near the goal may then hold an arm still that
+            is far away (docs/experiments/standing-still.md).
+        elbow_aside: Whether the plain postures that the head is shown may have the elbow to a side,
+            as those of `hvs_suite.cell.plain_postures`. Older weights know it straight above alone.
     """
 
     cameras: Mapping[str, tuple[int, int]]
@@ -151,6 +158,8 @@ class Shape:
     offsets: tuple[str, ...] = ()
     foresight: int = 0
     remembers: bool = True
+    corrects_within_m: float | None = None
+    elbow_aside: bool = True
 
 
 MEMORY_SIZE = BELIEF_SIZE + 2 * N_JOINTS + 2 + RECENT_SIZE
@@ -528,8 +537,7 @@ class BeliefNetwork(nn.Module):
         joints, velocity = self._moving(memory, state)
         ways = []
         ahead_s = self.cell.period_s + self.cell.lead_s
-        for over, faced in self._postures(ahead.detach(), normal.detach()):
-            turns, time_s, within = arm.way_to_posture(joints, over, faced)
+        for turns, time_s, within in self._plain_ways(joints, ahead.detach(), normal.detach()):
             gone = arm.along_way(turns, velocity[:, :-1], ahead_s)
             step = gone + (joints - set_point)[:, :-1]
             proposals.append(F.pad(step, (0, 1)))
@@ -556,28 +564,42 @@ class BeliefNetwork(nn.Module):
             weights = SURE * weights
         # Weights and gate can become nearly whole: near the goal one proposal is right as it is.
         mean = (weights.softmax(dim=1)[:, :, None] * torch.stack(proposals, dim=1)).sum(dim=1)
-        total = torch.asinh(mean / scale) + torch.sigmoid(is_corrected) * correction
+        corrected = torch.sigmoid(is_corrected)
+        if self.shape.corrects_within_m is not None:
+            far = (goal - here.position).norm(dim=1, keepdim=True)
+            corrected = corrected * (2.0 - far / self.shape.corrects_within_m).clamp(0.0, 1.0)
+        total = torch.asinh(mean / scale) + corrected * correction
         return Decision(total, torch.stack(said, dim=1), weights)
 
-    def _postures(self, goal: Tensor, normal: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Where the plain postures that the head is shown have the flange, and what they face.
+    def _plain_ways(
+        self, joints: Tensor, goal: Tensor, normal: Tensor
+    ) -> list[tuple[Tensor, Tensor, Tensor]]:
+        """The ways to the plain postures that the head is shown.
 
         Args:
+            joints: From where, (B, 7) rad.
             goal: Of the tip, (B, 3) m.
             normal: Of the surface, (B, 3).
 
         Returns:
-            Place (B, 3) m and unit normal (B, 3) of each.
+            Of each what `arm.way_to_posture` does.
         """
-        tool = self.cell.tool_length_m
-        places = [(goal + (height + tool) * normal, normal) for height in HEIGHTS_M]
+        tool, standoff = self.cell.tool_length_m, self.belief.standoff.float()
+        target = goal - standoff * normal
+        over = [goal + (height + tool) * normal for height in HEIGHTS_M]
+        facings = [(normal, over)]
         if self._sees_slopes:
-            standoff = self.belief.standoff.float()
-            target = goal - standoff * normal
             leaning = _leaning(normal, ARRIVES_LEANING * F.normalize(target[:, :2], dim=1))
-            for height in LEANING_HEIGHTS_M:
-                places.append((target + (standoff + height + tool) * leaning, leaning))
-        return places
+            over = [target + (standoff + height + tool) * leaning for height in LEANING_HEIGHTS_M]
+            facings.append((leaning, over))
+        ways = []
+        for facing, over in facings:
+            if self.shape.elbow_aside:
+                chosen = target + (CHOSEN_ABOVE_M + tool) * facing
+                ways += arm.ways_to_posture(joints, torch.stack(over, dim=1), facing, chosen)
+            else:
+                ways += [arm.way_to_posture(joints, place, facing) for place in over]
+        return ways
 
     @property
     def _sees_slopes(self) -> bool:

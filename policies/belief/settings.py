@@ -95,6 +95,8 @@ class Settings(pydantic.BaseModel):
         offsets: See `Shape`.
         foresight: See `Shape`.
         remembers: See `Shape`.
+        corrects_within_m: See `Shape`.
+        elbow_aside: See `Shape`.
     """
 
     model_config = pydantic.ConfigDict(extra="ignore")
@@ -119,6 +121,8 @@ class Settings(pydantic.BaseModel):
     offsets: tuple[Literal["eih", "eth"], ...] = ()
     foresight: Annotated[int, pydantic.Field(strict=True, ge=0, le=_MOST_PAST)] = 0
     remembers: Annotated[bool, pydantic.Field(strict=True)] = True
+    corrects_within_m: Annotated[float, pydantic.Field(gt=0.0, le=10.0)] | None = None
+    elbow_aside: Annotated[bool, pydantic.Field(strict=True)] = False
 
     @pydantic.model_validator(mode="after")
     def _fit(self) -> "Settings":
@@ -178,6 +182,8 @@ class Settings(pydantic.BaseModel):
             offsets=self.offsets,
             foresight=self.foresight,
             remembers=self.remembers,
+            corrects_within_m=self.corrects_within_m,
+            elbow_aside=self.elbow_aside,
         )
 
     def network(self) -> BeliefNetwork:

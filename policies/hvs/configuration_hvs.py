@@ -46,6 +46,9 @@ class HvsConfig(PreTrainedConfig):
         foresight: Control steps of which it remembers where the target was, see `Shape`; a new
             policy, where the targets of its dataset move.
         remembers: Whether it remembers what it has seen, see `Shape`.
+        corrects_within_m: How far from the goal the head corrects its ways, see `Shape`.
+        elbow_aside: Whether plain postures may have the elbow to a side, see `Shape`; for a new
+            policy they may.
         family: Family of the tasks that it was trained for.
         control_period_s: Length of their control step (s).
         options: Options of the task that it was trained with, where they differ from the named one;
@@ -79,6 +82,8 @@ class HvsConfig(PreTrainedConfig):
     offsets: tuple[str, ...] = ()
     foresight: int = 0
     remembers: bool = True
+    corrects_within_m: float | None = None
+    elbow_aside: bool = False
     family: str = FAMILY
     control_period_s: float = CONTROL_PERIOD_S
     options: dict[str, Any] = field(default_factory=dict)

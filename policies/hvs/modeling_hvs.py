@@ -196,6 +196,7 @@ def _take_over(config: HvsConfig, manifest: Manifest) -> None:
         setattr(config, name, value)
     config.cell = as_numbers(cell_model(spec))
     config.foresight = PAST_STEPS if manifest.has_moving_targets else 0
+    config.elbow_aside = True
 
 
 def save_checkpoint(policy: HvsPolicy, folder: Path) -> None:

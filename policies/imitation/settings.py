@@ -64,6 +64,7 @@ class Settings:
         without: What to leave out, of `PARTS`, to see what it is good for: ``memory`` of what was
             seen, and ``keypoints``, from which the eyes learn; without them they learn from what
             belief and head make of what they see.
+        corrects_within_m: See `hvs_suite.policies.belief.network.Shape`.
     """
 
     seed: int = 0
@@ -87,6 +88,7 @@ class Settings:
     slopes: tuple[str, ...] = ()
     offsets: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
+    corrects_within_m: float | None = None
 
     def reads(self, name: str) -> bool:
         """Whether the policy is given an input."""
@@ -142,6 +144,10 @@ class Settings:
         if self.episodes is not None and not 1 <= self.episodes <= manifest.n_episodes:
             raise OptionError(
                 f"episodes must be 1 to the dataset's {manifest.n_episodes}, not {self.episodes}"
+            )
+        if self.corrects_within_m is not None and not 0.0 < self.corrects_within_m <= 10.0:
+            raise OptionError(
+                f"corrects_within_m must be above 0 and at most 10, not {self.corrects_within_m}"
             )
         if not 0.0 < self.error_scale < math.inf:
             raise OptionError(f"error_scale must be above 0, not {self.error_scale}")
@@ -212,6 +218,8 @@ def new_policy(manifest: Manifest, settings: Settings) -> "HvsPolicy":
         offsets=settings.offsets,
         foresight=PAST_STEPS if manifest.has_moving_targets else 0,
         remembers="memory" not in settings.without,
+        corrects_within_m=settings.corrects_within_m,
+        elbow_aside=True,
         **trained_for(task).model_dump(),
     )
     # torch initialises weights from its global generator; leave that as it was found.

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from hvs_suite.cell import robot
 from hvs_suite.cell.kinematics import kinematics
+from hvs_suite.cell.plain_postures import ELBOWS_RAD
 from hvs_suite.policies.belief import arm
 from hvs_suite.policies.belief.geometry import flange_motion
 
@@ -47,6 +48,16 @@ def test_both_postures_hold_the_flange_at_the_place_and_face_the_normal(tilt: fl
         motion = flange_motion(torch.nn.functional.pad(q, (0, 1)))
         np.testing.assert_allclose(motion.position, place, atol=1e-5)
         np.testing.assert_allclose(motion.rotation[:, :, 2], -normal, atol=1e-5)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.3])
+def test_postures_for_each_place_of_the_elbow_are_those_of_the_kinematics(tilt: float) -> None:
+    place, normal = goals(50, tilt=tilt)
+    shapes = arm.postures_by_elbow(place[:, None].double(), normal[:, None].double())[:, 0]
+    for position, facing, q in zip(place, normal, shapes, strict=True):
+        expected = kinematics().goal_shapes(position, facing, np.array(ELBOWS_RAD))[:, :6]
+        apart = q.numpy() - expected
+        np.testing.assert_allclose(np.sin(0.5 * apart), 0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("tool_m", [0.0, 0.07])

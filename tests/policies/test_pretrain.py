@@ -222,6 +222,14 @@ def test_a_policy_may_be_made_without_a_memory(dataset, tmp_path):
         pretrain(dataset, tmp_path / "other", without=("head",), **STEP)
 
 
+def test_a_head_may_be_told_to_correct_near_the_goal_alone(dataset, tmp_path):
+    pretrain(dataset, tmp_path / "out", corrects_within_m=0.04, **STEP)
+    assert load_network(tmp_path / "out").shape.corrects_within_m == 0.04
+    check_compiled(tmp_path / "out")
+    with pytest.raises(OptionError, match="corrects_within_m must be above 0"):
+        pretrain(dataset, tmp_path / "other", corrects_within_m=0.0, **STEP)
+
+
 def test_eyes_alone_learn_slopes_once_they_have_found_the_target(dataset, tmp_path):
     options = {"steps": 2, "batch_size": 4, "eye_share": 1.0, "slopes": ("eih",)}
     pretrain(dataset, tmp_path / "out", **options)
