@@ -1,9 +1,9 @@
 """How the shipped weights were made: the commands of each named task, to repeat it.
 
-``recipes/<task>.json`` holds the training command of a policy, where it begins with the eyes of an
-earlier training the commands of that one, and where the suite ships a fine-tuned policy the command
-that makes it; the dataset's recipe in ``datasets/recipes`` has the recording command. Tasks that
-differ in tolerance alone share a policy.
+``recipes/<task>.json`` holds the training command of a policy, where it begins with the eyes or all
+weights of an earlier training the commands of that one, and where the suite ships a fine-tuned
+policy the command that makes it; the dataset's recipe in ``datasets/recipes`` has the recording
+command. Tasks that differ in tolerance alone share a policy.
 """
 
 import dataclasses
@@ -37,15 +37,16 @@ class Recipe:
     Attributes:
         task: Named task whose policy this is.
         record: Words after ``hvs`` that record the demonstrations.
-        eyes: Words after ``hvs`` of each command that makes the eyes ``pretrain`` begins with; none
-            if it begins with fresh ones or with eyes that the suite ships for other tasks.
+        earlier: Words after ``hvs`` of each command that makes what ``pretrain`` begins with, eyes
+            or all weights; none if it begins afresh or with eyes that the suite ships for other
+            tasks.
         pretrain: Words after ``hvs`` that train on them.
         finetune: Words after ``hvs`` that fine-tune what came of it; None if that is not shipped.
     """
 
     task: str
     record: tuple[str, ...]
-    eyes: tuple[tuple[str, ...], ...]
+    earlier: tuple[tuple[str, ...], ...]
     pretrain: tuple[str, ...]
     finetune: tuple[str, ...] | None
 
@@ -84,7 +85,7 @@ def recipe(task: str) -> Recipe:
     return Recipe(
         name,
         record=_words(recorded["command"]),
-        eyes=tuple(_words(command) for command in learned.get("eyes", ())),
+        earlier=tuple(_words(command) for command in learned.get("earlier", ())),
         pretrain=_words(learned["command"]),
         finetune=_words(finetune) if finetune else None,
     )

@@ -24,13 +24,19 @@ def test_a_recipe_trains_on_what_it_records(task):
     assert record.task == plan.task == trained_on(task)
     assert pretrain.data == record.out
     assert pretrain.steps
-    *recorded, learned = [parse(words) for words in plan.eyes] or [None]
-    if learned is not None:
-        assert learned.data in {made.out for made in (record, *recorded)}
-    for name in pretrain.eyes:
-        made_before = learned is not None and name == str(learned.out)
-        assert made_before or (HERE / "pretrained" / name).is_dir()
-    assert learned is None or str(learned.out) in pretrain.eyes
+    recorded, learned = {record.out}, set()
+    for words in (*plan.earlier, plan.pretrain):
+        made = parse(words)
+        if words[0] == "record":
+            recorded.add(made.out)
+            continue
+        assert made.data in recorded
+        begins_with = {*made.eyes, *filter(None, [made.weights])}
+        for name in begins_with - learned:
+            assert (HERE / "pretrained" / name).is_dir()
+        # What was learned before is of use: the next goes on from it.
+        assert not learned or begins_with & learned
+        learned.add(str(made.out))
     if plan.finetune is not None:
         finetune = parse(plan.finetune)
         assert (Path(finetune.policy), finetune.task) == (pretrain.out, plan.task)
