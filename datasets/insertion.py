@@ -6,7 +6,6 @@ before the tip enters the mouth.
 """
 
 import dataclasses
-import math
 
 import numpy as np
 import numpy.typing as npt
@@ -44,9 +43,10 @@ FUNNEL_TILT_DEG = 10.0
 FUNNEL_SLOPE = 4.0
 ASIDE_MM = 15.0
 """Largest step towards the axis."""
-PRESS_MM = 3.0
-"""How far below the tip the set point of one that presses gently is: the arm gives 0.2 mm a newton.
-"""
+GENTLE_MM = 1.0
+"""Step down of one that presses gently."""
+PRESS_N, EASE_N = 15.0, 5.0
+"""Pressed on with this it goes no deeper, and with so much less it begins to go slower."""
 SLIDE_MM = 1.5
 """How far beside the axis one that presses gently slides over the face, without going up."""
 LED_MM = 0.3
@@ -54,8 +54,7 @@ LED_MM = 0.3
 IN_MM = 1.0
 """From how deep on it is in the hole, where nothing is left to be pressed on but the bottom."""
 IN_STEP_MM = 3.0
-IN_PRESS_MM = 5.0
-"""Step down, and how far the set point may be below the tip, there."""
+"""Step down there."""
 SETTLED_SHARE = 1.0 / 3.0
 """Of how far off a tip may be and still be caught: so near to the axis it goes into the hole."""
 
@@ -110,7 +109,7 @@ class GuardedInsertion:
         goal: Goal,
         caught_mm: float,
         *,
-        gently: bool = False,
+        pressed_n: float | None = None,
     ) -> FloatArray:
         """As `next_set_point`, but it changes little where the arm stands a little elsewhere.
 
@@ -124,8 +123,9 @@ class GuardedInsertion:
             set_point: Now, (7,) rad.
             goal: In the hole: its target is the middle of the mouth, its standoff negative.
             caught_mm: How far beside the axis the mouth still catches the tip.
-            gently: Whether the hole may be elsewhere: then the tip must not press hard, slides over
-                the face, and goes where the mouth leads it.
+            pressed_n: What presses on the tip against its axis (N), where the hole may be
+                elsewhere: then it must not press hard, slides over the face, and goes where the
+                mouth leads it. None where the hole is where it seems to be.
 
         Returns:
             (7,) rad.
@@ -140,23 +140,21 @@ class GuardedInsertion:
             above = dataclasses.replace(goal, standoff_m=0.001 * ABOVE_MM)
             return self._planner.next_set_point(joints, velocity, above, onward=goal)
         off = max(sent[LATERAL], arm[LATERAL], within * arm[TILT] / SETTLED_DEG)
-        slow, press, led = SLOW_MM, math.inf, 0.0
-        if gently:
+        slow, eased, led = SLOW_MM, 1.0, 0.0
+        if pressed_n is not None:
             # The lower it is, the more it slides: going up at each small error takes all the time.
             off -= SLIDE_MM * _share(1.0 - arm[HEIGHT] / GATE_MM)
             # In the mouth, which may be elsewhere, it goes where the mouth leads it.
             led = _share(-arm[HEIGHT] / LED_MM)
             inside = _share((-arm[HEIGHT] - LED_MM) / (IN_MM - LED_MM))
-            slow += inside * (IN_STEP_MM - SLOW_MM)
-            press = PRESS_MM + inside * (IN_PRESS_MM - PRESS_MM)
+            slow = GENTLE_MM + inside * (IN_STEP_MM - GENTLE_MM)
+            eased = _share((PRESS_N - pressed_n) / EASE_N)
         least = 1000.0 * goal.standoff_m
         if arm[HEIGHT] > 0.0:
             # Through the mouth within one tolerance, above the gate from two on.
             least += (GATE_MM - least) * _share(off / within - 1.0)
             least += min(FUNNEL_SLOPE * max(off - 2.0 * within, 0.0), ABOVE_MM - GATE_MM)
-        if height < GATE_MM:
-            least = max(least, arm[HEIGHT] - press)
-        step = min(max(_BRAKING * (height - GATE_MM), slow), FAST_MM)
+        step = eased * min(max(_BRAKING * (height - GATE_MM), slow), FAST_MM)
         height = max(height - step, least) if height > least else min(height + FAST_MM, least)
         left = max(sent[LATERAL] - ASIDE_MM, 0.0) / max(sent[LATERAL], ASIDE_MM)
         aside = left * self._beside(set_point, goal)

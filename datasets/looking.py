@@ -40,7 +40,7 @@ from hvs_suite.datasets.planner import Planner
 from hvs_suite.tasks.shared.family import GOAL_UNSEEN
 from hvs_suite.tasks.shared.goal import Goal
 from hvs_suite.tasks.shared.panels import PanelSpec
-from hvs_suite.tasks.shared.peg_and_bushing import PegSpec
+from hvs_suite.tasks.shared.peg_and_bushing import WRENCH, PegSpec
 from hvs_suite.tasks.shared.spec import CAMERA_NAMES
 
 if TYPE_CHECKING:
@@ -121,8 +121,9 @@ class Demonstrator(Expert):
                 return ahead
         spec, goal = self._env.spec, self._goal_in(0.0)
         if isinstance(spec, PegSpec) and goal.standoff_m < 0.0:
+            pressed_n = -float(self._env.privileged()[WRENCH][2]) if self._unseen().any() else None
             return self._insertion.learnable_set_point(
-                q, velocity, set_point, goal, spec.caught_mm, gently=bool(self._unseen().any())
+                q, velocity, set_point, goal, spec.caught_mm, pressed_n=pressed_n
             )
         if isinstance(spec, PanelSpec) and self._has_seen_closely:
             way = way_down(spec)

@@ -32,7 +32,7 @@ from hvs_suite.tasks.shared.goal import (
     goal_errors,
 )
 from hvs_suite.tasks.shared.metric import Metric
-from hvs_suite.tasks.shared.peg_and_bushing import PegAndBushing, PegSpec
+from hvs_suite.tasks.shared.peg_and_bushing import WRENCH, PegAndBushing, PegSpec
 from hvs_suite.tasks.shared.placing import HARD, is_reachable, point_on_ring
 from hvs_suite.tasks.shared.scenario import Scenario, Streams
 from hvs_suite.tasks.shared.spec import Description, VectorObservation, scene
@@ -48,7 +48,6 @@ FloatArray = npt.NDArray[np.float64]
 
 DEPTH = "depth_error_mm"
 PEAK_FORCE = "peak_force_n"
-WRENCH = "wrench"
 LIFT_M = 0.050
 """How far above the mouth the tip comes from (m): the peg does not hide the bushing yet."""
 _IN_HOLE_MM = 0.1

@@ -13,9 +13,10 @@ from hvs_suite.datasets.insertion import GATE_MM, GuardedInsertion
 from hvs_suite.policies.servo.still_target import StillTargetServo
 from hvs_suite.policies.servo.target_estimate import DISC_PLANE_M, Sight
 from hvs_suite.rollout import Observation
-from hvs_suite.tasks.insert import WRENCH, InsertSpec
+from hvs_suite.tasks.insert import InsertSpec
 from hvs_suite.tasks.shared.feeling import HoleSearch, search_of
 from hvs_suite.tasks.shared.goal import HEIGHT, LATERAL, UP, Goal
+from hvs_suite.tasks.shared.peg_and_bushing import WRENCH
 
 FloatArray = npt.NDArray[np.float64]
 

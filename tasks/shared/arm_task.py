@@ -431,7 +431,8 @@ class ArmTask(composer.Task):
             of the tip; ``goal_normal`` (3,); ``target_position`` (3,) m; for each keypoint and
             camera ``<keypoint>_<camera>`` (4,): u, v of its centre in [-1, 1] over the image (x
             right, y down), apparent diameter in image widths, and 1 where it can be seen, else 0
-            (u, v and diameter are then 0); and what the family adds.
+            (u, v and diameter are then 0); what the family adds; and its further observations,
+            without noise.
         """
         goal = self.goal()
         return {
@@ -446,6 +447,7 @@ class ArmTask(composer.Task):
                 for camera in CAMERA_NAMES
             },
             **self.family.privileged(),
+            **self.family.observe(physics),
         }
 
     def in_image(self, physics: mjcf.Physics, keypoint: Keypoint, name: str) -> FloatArray:

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 FloatArray = npt.NDArray[np.float64]
 
+WRENCH = "wrench"
+"""What the tool feels, as an observation."""
 FORCE_LOW_PASS_HZ = 50.0
-
-
 BOTTOM_M = 0.003
 """Material below the hole; as the cell's, spelled out because that loads MuJoCo."""
 MIN_CLEARANCE_MM = 0.05

@@ -17,7 +17,9 @@ from hvs_suite.tasks.shared.goal import UP, Goal
 HEIGHT_M = 0.04
 
 
-def sent_from(task: str, beside_m: float, height_m: float, way: str) -> npt.NDArray[np.float64]:
+def sent_from(
+    task: str, beside_m: float, height_m: float, way: str, pressed_n: float = 0.0
+) -> npt.NDArray[np.float64]:
     """Where the tip is sent by the goal (mm), from where it and its set point stand."""
     spec = TASKS[task]
     assert isinstance(spec, InsertSpec)
@@ -34,7 +36,7 @@ def sent_from(task: str, beside_m: float, height_m: float, way: str) -> npt.NDAr
         insertion.next_set_point(q, still, q, goal)
         if way == "expert"
         else insertion.learnable_set_point(
-            q, still, q, goal, spec.caught_mm, gently=way == "gentle"
+            q, still, q, goal, spec.caught_mm, pressed_n=pressed_n if way == "gentle" else None
         )
     )
     return np.asarray(1000.0 * (model.tip_pose(sent)[1] - goal.target))
@@ -80,15 +82,15 @@ def test_demonstrations_press_gently_where_the_paint_says() -> None:
                 time_step = env.step(demonstrator.label())
             painted = env.task.family.keypoints()["target"].position
             beside = env.tip().position - painted
-            # What it presses with bends the arm a little sideways.
-            assert np.hypot(*beside[:2]) < 0.0012
+            # What it presses with bends the arm sideways.
+            assert np.hypot(*beside[:2]) < 0.002
             assert abs(beside[2]) < 0.0005
             assert not env.info["overload"]
             assert env.info["errors"]["peak_force_n"] > 5.0
 
 
 def test_one_that_presses_gently_slides_over_the_face_and_does_not_go_up() -> None:
-    assert sent_from("insert-feel", 0.001, 0.0, "gentle")[2] < -1.0
+    assert sent_from("insert-feel", 0.001, 0.0, "gentle")[2] < -0.9
     assert sent_from("insert-feel", 0.001, 0.0005, "learnable")[2] > 1.0
 
 
@@ -104,8 +106,16 @@ def test_one_that_presses_gently_goes_faster_in_the_hole() -> None:
     on_face, in_hole = (
         sent_from("insert-feel", 0.0, height, "gentle")[2] for height in (0.0, -0.005)
     )
-    assert on_face == pytest.approx(-1.5, abs=0.1)
+    assert on_face == pytest.approx(-1.0, abs=0.1)
     assert in_hole == pytest.approx(-5.0 - 3.0, abs=0.1)
+
+
+@pytest.mark.parametrize(("pressed_n", "deeper_mm"), [(10.0, 1.0), (12.5, 0.5), (15.0, 0), (30, 0)])
+def test_the_harder_it_is_pressed_on_the_slower_it_goes_down(
+    pressed_n: float, deeper_mm: float
+) -> None:
+    sent = sent_from("insert-feel", 0.0, 0.0, "gentle", pressed_n)
+    assert sent[2] == pytest.approx(-deeper_mm, abs=0.1)
 
 
 def test_demonstrations_pass_higher_over_the_table_than_the_expert() -> None:

@@ -13,9 +13,10 @@ from hvs_suite.cell.robot import JOINT_ACCELERATION_RAD_S2
 from hvs_suite.datasets.expert import make_expert
 from hvs_suite.errors import OptionError
 from hvs_suite.rollout import run_episode
-from hvs_suite.tasks.insert import DEPTH, PEAK_FORCE, WRENCH
+from hvs_suite.tasks.insert import DEPTH, PEAK_FORCE
 from hvs_suite.tasks.shared.environment import Environment
 from hvs_suite.tasks.shared.goal import LATERAL, UP, Tip
+from hvs_suite.tasks.shared.peg_and_bushing import WRENCH
 
 FloatArray = npt.NDArray[np.float64]
 
