@@ -1,13 +1,14 @@
 """Why a policy fails: every lost scenario of a result, played again and sorted by its cause.
 
 The causes need different remedies. A target that was never seen needs better looking, one that was
-seen but misplaced needs a better eye, and one that was placed well but not reached needs better
-control or more speed.
+seen but misplaced, or whose slope was misjudged, needs a better eye, and one of which all was known
+but which was not reached needs better control or more speed.
 """
 
 import contextlib
 import dataclasses
 import enum
+import math
 import statistics
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,6 +32,7 @@ from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork
 from hvs_suite.policies.checkpoints.files import read_config
 from hvs_suite.policies.checkpoints.loading import load_network, network_inputs
 from hvs_suite.rollout import Action, Observation, one_torch_thread
+from hvs_suite.tasks.shared.goal import TILT
 from hvs_suite.tasks.shared.option_types import listed
 from hvs_suite.tasks.shared.spec import Spec
 
@@ -52,8 +54,24 @@ class Cause(enum.StrEnum):
     OVERLOADED = "pressed too hard"
     NOT_SEEN = "target not seen"
     MISPLACED = "seen but misplaced"
+    MISJUDGED = "slope misjudged"
     SLOW = "too slow"
     CONTROLLED = "controlled badly"
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """How far off a policy was at its last decision, in the flange's frame.
+
+    Where the joints measure wrongly it need not know where in the room flange and target stand.
+
+    Attributes:
+        place_mm: From where the target was to where the policy took it to be, sideways (mm).
+        slope_deg: Between the surface's normal there and the believed one (deg).
+    """
+
+    place_mm: float
+    slope_deg: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,9 +84,7 @@ class Failure:
         steps: Control steps played.
         errors: The task's metrics at the end.
         seen_steps: Decisions at which a camera had the target in view.
-        estimate_error_mm: How far off sideways the policy took the target to be at its last
-            decision (mm), as seen from the flange: where the joints measure wrongly it need not
-            know where either of them stands. None where the policy does not say.
+        off: How far off the policy was. None where it does not say.
         target_radius_m: Distance of the target from the base's axis (m).
     """
 
@@ -77,7 +93,7 @@ class Failure:
     steps: int
     errors: Mapping[str, float]
     seen_steps: int
-    estimate_error_mm: float | None
+    off: Estimate | None
     target_radius_m: float
 
 
@@ -134,7 +150,7 @@ def sort_failures(
     Args:
         path: The result; its action log stands beside it.
         checkpoint: The `hvs` policy that made it, to ask where it took the target to be; None where
-            there is none, and then nothing counts as misplaced.
+            there is none, and then nothing counts as misplaced or misjudged.
         progress: Called after each lost scenario.
 
     Returns:
@@ -182,16 +198,19 @@ class _Asked:
         """A new episode begins."""
         self._memory = self._network.start(1)
 
-    def way_to_target(self, observation: Observation) -> FloatArray:
-        """The way from the flange, by the measured joints, to the believed target, (3,) m."""
+    def target_at_flange(self, observation: Observation) -> tuple[FloatArray, FloatArray]:
+        """Believed target (3,) m and normal (3,) in the frame of the flange as it is measured."""
         network = self._network
         inputs = network_inputs(network, self._config, observation)
         q = inputs.state[:, :N_JOINTS]
         with torch.inference_mode(), one_torch_thread():
             sightings = network.look(inputs.images, inputs.goal)
             self._memory = network.remember(self._memory, sightings, q)
-            way = self._memory[:, PLACE] - flange_motion(q.double()).position
-        return np.array(way[0].numpy())
+            flange = flange_motion(q.double())
+            way = self._memory[:, PLACE] - flange.position
+            seen = torch.stack([way, network.belief.normal(self._memory)], dim=1) @ flange.rotation
+        place, normal = seen[0].numpy()
+        return place, normal
 
     def remember(self, action: Action) -> None:
         """Where the arm was sent."""
@@ -207,7 +226,7 @@ def _sort(
     target = np.asarray(env.privileged()["target_position"])
     if asked is not None:
         asked.reset()
-    off_mm: float | None = None
+    off: Estimate | None = None
     seen = 0
     distances_m = [env.distance_m]
     spec = env.action_spec()
@@ -218,20 +237,24 @@ def _sort(
         seen += any(truth[f"target_{camera}"][3] > 0.5 for camera in ("eih", "eth"))
         executed = np.clip(action, spec.minimum, spec.maximum).astype(np.float32)
         if asked is not None:
-            _, flange = kinematics().flange_pose(env.joint_positions)
-            way = np.asarray(truth["target_position"]) - flange
-            off = asked.way_to_target(time_step.observation) - way
-            off_mm = 1e3 * float(np.linalg.norm(off[:2]))
+            rotation, flange = kinematics().flange_pose(env.joint_positions)
+            place, normal = asked.target_at_flange(time_step.observation)
+            beside = rotation @ place - (np.asarray(truth["target_position"]) - flange)
+            leaning = float(np.dot(rotation @ normal, truth["goal_normal"]))
+            off = Estimate(
+                place_mm=1e3 * float(np.linalg.norm(beside[:2])),
+                slope_deg=math.degrees(math.acos(min(leaning, 1.0))),
+            )
             asked.remember(executed)
         time_step = env.step(executed)
         distances_m.append(env.distance_m)
     return Failure(
         scenario=row.scenario,
-        cause=cause_of(row, env.spec, seen, off_mm, distances_m),
+        cause=cause_of(row, env.spec, seen, off, distances_m),
         steps=row.steps,
         errors=row.errors,
         seen_steps=seen,
-        estimate_error_mm=off_mm,
+        off=off,
         target_radius_m=float(np.hypot(target[0], target[1])),
     )
 
@@ -240,7 +263,7 @@ def cause_of(
     row: EpisodeRow,
     spec: Spec,
     seen_steps: int,
-    estimate_error_mm: float | None,
+    off: Estimate | None,
     distances_m: Sequence[float],
 ) -> Cause:
     """Why a scenario was lost.
@@ -249,7 +272,7 @@ def cause_of(
         row: Its outcome.
         spec: The task's parameters.
         seen_steps: As in `Failure`.
-        estimate_error_mm: As in `Failure`.
+        off: As in `Failure`.
         distances_m: Distance to the goal at the start and after every step (m).
     """
     if row.failure is not None:
@@ -258,8 +281,10 @@ def cause_of(
         return Cause.OVERLOADED if spec.is_overload(row.errors) else Cause.COLLIDED
     if not seen_steps:
         return Cause.NOT_SEEN
-    if estimate_error_mm is not None and estimate_error_mm > spec.tightest_tolerance_mm:
+    if off is not None and off.place_mm > spec.tightest_tolerance_mm:
         return Cause.MISPLACED
+    if off is not None and off.slope_deg > spec.step_bounds.get(TILT, math.inf):
+        return Cause.MISJUDGED
     if distances_m[-1] < _FALLING * distances_m[-1 - min(_LAST_STEPS, len(distances_m) - 1)]:
         return Cause.SLOW
     return Cause.CONTROLLED
@@ -285,19 +310,23 @@ def markdown(reports: Sequence[Report]) -> str:
         headline = registry.find(report.task).headline[0]
         lines += [
             f"| cause | lost | share | median {headline} | median error of the estimate, mm "
-            "| median radius of the target, m | scenarios |",
-            "|---|---|---|---|---|---|---|",
+            "| and of the slope, deg | median radius of the target, m | scenarios |",
+            "|---|---|---|---|---|---|---|---|",
         ]
         for cause in Cause:
             if not counts[cause]:
                 continue
             found = report.of(cause)
-            off = [f.estimate_error_mm for f in found if f.estimate_error_mm is not None]
+            off = [failure.off for failure in found if failure.off is not None]
+            place, slope = (
+                f"{statistics.median(values):.2f}" if values else "-"
+                for values in ([each.place_mm for each in off], [each.slope_deg for each in off])
+            )
             scenarios = ", ".join(str(failure.scenario) for failure in found[:8])
             lines.append(
                 f"| {cause} | {len(found)} | {100 * len(found) / report.n_episodes:.1f} % | "
                 f"{statistics.median(f.errors[headline] for f in found):.2f} | "
-                f"{f'{statistics.median(off):.2f}' if off else '-'} | "
+                f"{place} | {slope} | "
                 f"{statistics.median(f.target_radius_m for f in found):.2f} | "
                 f"{scenarios}{', ...' if len(found) > 8 else ''} |"
             )

@@ -13,6 +13,7 @@ from hvs_suite.eval.studies.grid import Cell, Plan
 from hvs_suite.eval.studies.training import Scenes
 from hvs_suite.eval.studies.ways import EVERYWHERE_M, Finetuning, Imitation, Scratch, Way
 from hvs_suite.policies.imitation.dagger import TeacherName
+from hvs_suite.policies.rl.curriculum import Kind
 from hvs_suite.policies.training.dataset import read_manifest
 
 BASE, FINETUNED, SCRATCH = "base", "RL fine-tuning", "RL from scratch"
@@ -32,6 +33,7 @@ def plan(
     imitation_rounds: int,
     episodes: int,
     reach_m: float = EVERYWHERE_M,
+    curriculum: Kind | None = None,
     eyes: str | None = None,
     quick: bool = False,
 ) -> Plan:
@@ -47,6 +49,7 @@ def plan(
         imitation_rounds: Rounds that its environment steps are spread over.
         episodes: Scenes that each policy is judged on.
         reach_m: How far from the goal fine-tuning moves it (m).
+        curriculum: Easier levels that fine-tuning begins on; None for none.
         eyes: Named task of whose shipped weights all eyes begin with; None for fresh ones.
         quick: Make everything in minutes, of next to no training.
 
@@ -88,6 +91,7 @@ def plan(
                     task=task,
                     steps=env_steps,
                     settings={"reach_m": reach_m},
+                    curriculum=curriculum,
                     evaluations=evaluations,
                     eval_episodes=few,
                 ),

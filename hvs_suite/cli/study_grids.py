@@ -225,6 +225,8 @@ class FewDemonstrations(Grid):
         imitation_steps: Optimiser steps of DAgger, its base's included.
         imitation_rounds: Rounds that its environment steps are spread over.
         reach_m: How far from the goal fine-tuning moves it (m).
+        curriculum: Easier levels that fine-tuning begins on: wider tolerances, or starts near the
+            goal; none by default.
         eyes: Named task of whose shipped weights all eyes begin with; fresh ones by default.
         episodes: Scenes of split dev that bases and ends are judged on.
     """
@@ -237,6 +239,7 @@ class FewDemonstrations(Grid):
     imitation_steps: int = 2_500
     imitation_rounds: int = 4
     reach_m: float = 10.0
+    curriculum: Literal["tolerance", "start"] | None = None
     eyes: str | None = None
     episodes: int = 200
 
@@ -253,6 +256,7 @@ class FewDemonstrations(Grid):
             imitation_steps=self.imitation_steps,
             imitation_rounds=self.imitation_rounds,
             reach_m=self.reach_m,
+            curriculum=self.curriculum,
             eyes=self.eyes,
             episodes=self.episodes,
             quick=self.quick,

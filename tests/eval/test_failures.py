@@ -1,12 +1,16 @@
 """Why policies fail: each kind of failure is told from the others."""
 
+import dataclasses
+
 import pytest
 from test_result_file import row
 
 import hvs_suite
 from hvs_suite.cli.main import run
 from hvs_suite.eval import protocol
-from hvs_suite.eval.studies.failures import Cause, cause_of, markdown, sort_failures
+from hvs_suite.eval.studies.failures import Cause, Estimate, cause_of, markdown, sort_failures
+from hvs_suite.policies.catalogue import checkpoint_folder
+from hvs_suite.tasks.shared.panels import MAX_TILT_DEG
 
 TASK = "align-easy"
 
@@ -38,18 +42,35 @@ def test_a_failure_has_its_cause(policy, cause, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("estimate_mm", "distances_mm", "cause"),
+    ("off", "distances_mm", "cause"),
     [
-        (7.0, [900.0, 30.0, 8.0, 7.0, 7.0], Cause.MISPLACED),
-        (0.5, [900.0, 90.0, 60.0, 30.0, 9.0], Cause.SLOW),
-        (0.5, [900.0, 9.0, 9.0, 9.0, 9.0], Cause.CONTROLLED),
+        (Estimate(7.0, 0.1), [900.0, 30.0, 8.0, 7.0, 7.0], Cause.MISPLACED),
+        (Estimate(0.5, 9.0), [900.0, 30.0, 8.0, 7.0, 7.0], Cause.MISJUDGED),
+        (Estimate(0.5, 0.1), [900.0, 90.0, 60.0, 30.0, 9.0], Cause.SLOW),
+        (Estimate(0.5, 0.1), [900.0, 9.0, 9.0, 9.0, 9.0], Cause.CONTROLLED),
         (None, [900.0, 90.0], Cause.SLOW),
     ],
 )
-def test_an_estimate_and_the_last_steps_tell_eye_from_hand(estimate_mm, distances_mm, cause):
+def test_an_estimate_and_the_last_steps_tell_eye_from_hand(off, distances_mm, cause):
     lost = row(0, success=False, error=distances_mm[-1])
     distances_m = [distance / 1000 for distance in distances_mm]
-    assert cause_of(lost, hvs_suite.TASKS[TASK], 3, estimate_mm, distances_m) is cause
+    assert cause_of(lost, hvs_suite.TASKS[TASK], 3, off, distances_m) is cause
+
+
+def test_a_network_is_asked_for_place_and_slope(tmp_path):
+    path, task = tmp_path / "result.json", "surface-tilted"
+    protocol.evaluate("zero", task, path, split="dev", episodes=3)
+    report = sort_failures(path, checkpoint_folder("pretrained", task))
+    seen = [failure for failure in report.failures if failure.seen_steps]
+    assert seen
+    for failure in seen:
+        # From above the cell one eye tells the place, and hardly the slope.
+        assert failure.off.place_mm < 20.0
+        assert 1.0 < failure.off.slope_deg < 2 * MAX_TILT_DEG
+        assert failure.cause in (Cause.MISPLACED, Cause.MISJUDGED)
+    assert f"{seen[0].off.slope_deg:.2f}" in markdown(
+        [dataclasses.replace(report, failures=seen[:1])]
+    )
 
 
 def test_what_was_solved_is_no_failure(tmp_path):

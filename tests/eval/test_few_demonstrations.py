@@ -20,7 +20,7 @@ pytestmark = pytest.mark.timeout(600)
 
 
 def test_every_way_has_the_same_steps_and_is_not_made_twice(tmp_path, capsys):
-    words = [*WORDS, *TEACHERS, "--quick", "--out", str(tmp_path)]
+    words = [*WORDS, *TEACHERS, "--curriculum", "start", "--quick", "--out", str(tmp_path)]
     assert run(words) == 0
     study = Study.model_validate_json((tmp_path / "study.json").read_text())
     cells = {cell.name: cell for cell in study.finished}
@@ -32,6 +32,7 @@ def test_every_way_has_the_same_steps_and_is_not_made_twice(tmp_path, capsys):
         assert steps[-1] == 120
         assert steps == sorted({*steps})
         assert cells[name].curve[-1].n_success == cells[name].judged[0].solved.count("1")
+    assert "--curriculum start" in cells[FINETUNED].commands[-2]
     # RL and DAgger begin with the same demonstrations; the labels are another teacher's.
     demonstrator, servo = (cells[name].commands[-2] for name in ways[1:])
     assert demonstrator.replace("demonstrator", "servo").split("--out")[0] in servo
