@@ -6,15 +6,22 @@ which a teacher labels every one of those steps. RL from scratch has them withou
 """
 
 from collections.abc import Sequence
-from pathlib import Path
 
 from hvs_suite.errors import OptionError
 from hvs_suite.eval.studies.grid import Cell, Plan
 from hvs_suite.eval.studies.training import Scenes
-from hvs_suite.eval.studies.ways import EVERYWHERE_M, Finetuning, Imitation, Scratch, Way
+from hvs_suite.eval.studies.ways import (
+    EVERYWHERE_M,
+    NOISE_RAD,
+    Finetuning,
+    Imitation,
+    Recording,
+    Scratch,
+    Way,
+)
 from hvs_suite.policies.imitation.dagger import TeacherName
 from hvs_suite.policies.rl.curriculum import Kind
-from hvs_suite.policies.training.dataset import read_manifest
+from hvs_suite.registry import find
 
 BASE, FINETUNED, SCRATCH = "base", "RL fine-tuning", "RL from scratch"
 EVALUATIONS = 5
@@ -23,7 +30,7 @@ EVAL_EPISODES = 100
 
 
 def plan(
-    data: Path,
+    task: str,
     *,
     demonstrations: Sequence[int],
     teachers: Sequence[TeacherName],
@@ -32,6 +39,7 @@ def plan(
     imitation_steps: int,
     imitation_rounds: int,
     episodes: int,
+    noise: float = NOISE_RAD,
     reach_m: float = EVERYWHERE_M,
     curriculum: Kind | None = None,
     eyes: str | None = None,
@@ -40,26 +48,27 @@ def plan(
     """Bases, what comes of each, and RL without one.
 
     Args:
-        data: Recorded dataset, whose task is played.
-        demonstrations: How many to learn from, the first ones of the dataset.
+        task: Named task.
+        demonstrations: How many to learn from, the first ones of one recording.
         teachers: Who label the steps of DAgger, a cell each.
         env_steps: Environment steps of each way.
         base_steps: Optimiser steps of each base.
         imitation_steps: Optimiser steps of DAgger, its base's included.
         imitation_rounds: Rounds that its environment steps are spread over.
         episodes: Scenes that each policy is judged on.
+        noise: Of the recording, see `Recording`.
         reach_m: How far from the goal fine-tuning moves it (m).
         curriculum: Easier levels that fine-tuning begins on; None for none.
         eyes: Named task of whose shipped weights all eyes begin with; None for fresh ones.
         quick: Make everything in minutes, of next to no training.
 
     Raises:
-        DatasetError: The dataset cannot be read.
+        UnknownTaskError: There is no such task.
         OptionError: A number makes no sense.
     """
-    manifest = read_manifest(data)
+    find(task)
     if quick:
-        demonstrations, env_steps, episodes = (3,), 120, 2
+        demonstrations, env_steps, episodes = (3,), 40, 2
         base_steps, imitation_steps, imitation_rounds = 2, 6, 2
     for name, number in (
         ("base_steps", base_steps),
@@ -72,17 +81,16 @@ def plan(
                 f"{name} must be at least {'imitation_rounds' if name == 'env_steps' else 1}"
             )
     for count in demonstrations:
-        if not 2 <= count <= manifest.n_episodes:
-            raise OptionError(
-                f"demonstrations must be 2 to the dataset's {manifest.n_episodes}, not {count}"
-            )
-    task, on = manifest.task, [Scenes(task=manifest.task)]
+        if count < 2:
+            raise OptionError(f"demonstrations must be at least 2, not {count}")
+    data = Recording(
+        task=task, episodes=max(demonstrations), options={"start": "mixed"}, noise=noise
+    )
+    on = [Scenes(task=task)]
     few, evaluations = min(EVAL_EPISODES, episodes), 1 if quick else EVALUATIONS
     cells = []
     for count in demonstrations:
-        base = Imitation(
-            data=data.resolve(), steps=base_steps, settings={"episodes": count}, eyes=eyes
-        )
+        base = Imitation(data=data, steps=base_steps, settings={"episodes": count}, eyes=eyes)
         ways: dict[str, tuple[Way, str | None]] = {
             BASE: (base, None),
             FINETUNED: (
@@ -100,7 +108,7 @@ def plan(
         }
         for teacher in teachers:
             taught = Imitation(
-                data=data.resolve(),
+                data=data,
                 steps=imitation_steps,
                 settings={
                     "episodes": count,

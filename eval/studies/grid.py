@@ -373,8 +373,7 @@ def make_all(
 def _learned_from(way: Way) -> Recording | None:
     """The recording that a way needs."""
     imitation = way.base if isinstance(way, Finetuning) else way
-    data = imitation.data if isinstance(imitation, Imitation) else None
-    return data if isinstance(data, Recording) else None
+    return imitation.data if isinstance(imitation, Imitation) else None
 
 
 @dataclasses.dataclass(frozen=True)

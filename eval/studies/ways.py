@@ -39,11 +39,13 @@ class Recording:
         task: Named task.
         episodes: How many.
         options: Task options that differ from it.
+        noise: See `hvs_suite.datasets.recorder.record` (rad).
     """
 
     task: str
     episodes: int
     options: Options = dataclasses.field(default_factory=dict)
+    noise: float = NOISE_RAD
 
     def folder(self, out: Path) -> Path:
         """Where a study keeps it."""
@@ -60,7 +62,7 @@ class Recording:
             self.folder(out),
             self.options,
             workers=workers,
-            noise=NOISE_RAD,
+            noise=self.noise,
             resume=True,
             progress=on_progress,
             command=self.command(out),
@@ -68,7 +70,7 @@ class Recording:
 
     def command(self, out: Path) -> str:
         """The command that records it."""
-        words = {"task": self.task, "episodes": self.episodes, "noise": NOISE_RAD}
+        words = {"task": self.task, "episodes": self.episodes, "noise": self.noise}
         return command("record", {**words, "out": self.folder(out), "option": self.options})
 
 
@@ -77,20 +79,16 @@ class Imitation:
     """Behaviour cloning, with DAgger where its settings say so.
 
     Attributes:
-        data: What to learn from: a recording of the study's own, or a dataset.
+        data: What to learn from.
         steps: Optimiser steps.
         settings: Of `hvs_suite.policies.imitation.pretrain.pretrain`, where not the defaults.
         eyes: Named task of whose shipped weights the eyes begin with; None for fresh ones.
     """
 
-    data: Recording | Path
+    data: Recording
     steps: int
     settings: Options = dataclasses.field(default_factory=dict)
     eyes: str | None = None
-
-    def data_folder(self, out: Path) -> Path:
-        """Where the demonstrations are."""
-        return self.data.folder(out) if isinstance(self.data, Recording) else self.data
 
     def folder(self, out: Path, seed: int) -> Path:
         """Where a study keeps the run."""
@@ -102,7 +100,7 @@ class Imitation:
         from hvs_suite.policies.imitation.pretrain import pretrain
 
         pretrain(
-            self.data_folder(out),
+            self.data.folder(out),
             policy,
             steps=self.steps,
             eyes=[] if self.eyes is None else [checkpoint_folder("pretrained", self.eyes)],
@@ -114,9 +112,8 @@ class Imitation:
 
     def commands(self, out: Path, seed: int) -> Iterator[str]:
         """The commands that make the same policy."""
-        if isinstance(self.data, Recording):
-            yield self.data.command(out)
-        words = {"data": self.data_folder(out), "out": self.folder(out, seed) / POLICY}
+        yield self.data.command(out)
+        words = {"data": self.data.folder(out), "out": self.folder(out, seed) / POLICY}
         yield command(
             "pretrain",
             {**words, "steps": self.steps, **self.settings, "eyes": self.eyes, "seed": seed},

@@ -216,9 +216,10 @@ class FewDemonstrations(Grid):
     same command goes on.
 
     Attributes:
-        data: Recorded dataset; its task is played.
+        task: Named task.
         demonstrations: How many to learn from; give it several times; 25, 50, 100 and 200 by
-            default.
+            default. The most are recorded, and the first ones are for all.
+        noise: See hvs record (rad).
         teacher: Who labels the steps of DAgger; give it several times; the demonstrator by default.
         env_steps: Environment steps of each way.
         base_steps: Optimiser steps of each base.
@@ -231,8 +232,9 @@ class FewDemonstrations(Grid):
         episodes: Scenes of split dev that bases and ends are judged on.
     """
 
-    data: Path
+    task: str
     demonstrations: tuple[int, ...] = ()
+    noise: float = 0.02
     teacher: tuple[Literal["demonstrator", "expert", "servo"], ...] = ()
     env_steps: int = 16_000
     base_steps: int = 1_000
@@ -248,8 +250,9 @@ class FewDemonstrations(Grid):
         from hvs_suite.eval.studies import few_demonstrations
 
         return few_demonstrations.plan(
-            self.data,
+            self.task,
             demonstrations=self.demonstrations or (25, 50, 100, 200),
+            noise=self.noise,
             teachers=self.teacher or ("demonstrator",),
             env_steps=self.env_steps,
             base_steps=self.base_steps,
