@@ -3,7 +3,6 @@
 import dataclasses
 import shlex
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 from safetensors.torch import load_file
@@ -29,7 +28,6 @@ from hvs_suite.eval.studies.ways import Imitation, Recording
 from hvs_suite.registry import TASKS, find
 from hvs_suite.rollout import one_torch_thread
 
-SAMPLE = Path(__file__).parents[2] / "datasets" / "samples" / "align-thesis"
 STUDIES: dict[str, Callable[..., Plan]] = {
     module.__name__.rpartition(".")[2]: module.plan
     for module in (
@@ -49,8 +47,8 @@ PLANS = {
     for quick in (False, True)
 } | {
     "few_demonstrations": few_demonstrations.plan(
-        SAMPLE, demonstrations=[3, 5], teachers=["expert", "servo"], env_steps=120, base_steps=2,
-        imitation_steps=3, imitation_rounds=2, episodes=2, eyes="align-hard",
+        "align-thesis", demonstrations=[3, 5], teachers=["expert", "servo"], env_steps=120,
+        base_steps=2, imitation_steps=3, imitation_rounds=2, episodes=2, eyes="align-hard",
     ),
 }  # fmt: skip
 DATA = Recording(task="align-thesis", episodes=3, options={"start": "mixed"})
