@@ -46,7 +46,7 @@ ASIDE_MM = 15.0
 GENTLE_MM = 1.0
 """Step down of one that presses gently."""
 PRESS_N, EASE_N = 15.0, 5.0
-"""Pressed on with this it goes no deeper, and with so much less it begins to go slower."""
+"""Where this presses on its tip (N) it goes no deeper, and slower where so much less does (N)."""
 SLIDE_MM = 1.5
 """How far beside the axis one that presses gently slides over the face, without going up."""
 LED_MM = 0.3

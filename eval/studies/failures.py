@@ -1,8 +1,8 @@
 """Why a policy fails: every lost scenario of a result, played again and sorted by its cause.
 
 The causes need different remedies. A target that was never seen needs better looking, one that was
-seen but misplaced, or whose slope was misjudged, needs a better eye, and one of which all was known
-but which was not reached needs better control or more speed.
+seen but misplaced, or whose slope was misjudged, needs a better eye, and one that was known well
+but not reached needs better control or more speed.
 """
 
 import contextlib
@@ -243,7 +243,7 @@ def _sort(
             leaning = float(np.dot(rotation @ normal, truth["goal_normal"]))
             off = Estimate(
                 place_mm=1e3 * float(np.linalg.norm(beside[:2])),
-                slope_deg=math.degrees(math.acos(min(leaning, 1.0))),
+                slope_deg=math.degrees(math.acos(min(max(leaning, -1.0), 1.0))),
             )
             asked.remember(executed)
         time_step = env.step(executed)
