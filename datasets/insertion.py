@@ -45,9 +45,9 @@ ASIDE_MM = 15.0
 """Largest step towards the axis."""
 GENTLE_MM = 1.0
 """Step down of one that presses gently."""
-PRESS_N, EASE_N = 15.0, 5.0
+PRESS_N, EASE_N = 22.0, 5.0
 """Where this presses on its tip (N) it goes no deeper, and slower where so much less does (N)."""
-SLIDE_MM = 1.5
+SLIDE_MM = 3.0
 """How far beside the axis one that presses gently slides over the face, without going up."""
 LED_MM = 0.3
 """From how deep in the mouth it lets the mouth alone lead it sideways."""

@@ -8,7 +8,7 @@ import hvs_suite
 from hvs_suite.cell.kinematics import kinematics
 from hvs_suite.cell.robot import JOINT_ACCELERATION_RAD_S2
 from hvs_suite.datasets.expert import Expert
-from hvs_suite.datasets.insertion import GuardedInsertion
+from hvs_suite.datasets.insertion import SLIDE_MM, GuardedInsertion
 from hvs_suite.datasets.looking import Demonstrator
 from hvs_suite.registry import TASKS
 from hvs_suite.tasks.insert import InsertSpec
@@ -82,8 +82,8 @@ def test_demonstrations_press_gently_where_the_paint_says() -> None:
                 time_step = env.step(demonstrator.label())
             painted = env.task.family.keypoints()["target"].position
             beside = env.tip().position - painted
-            # What it presses with bends the arm sideways.
-            assert np.hypot(*beside[:2]) < 0.002
+            # What it presses with bends the arm sideways, and it lets the tip slide so far.
+            assert np.hypot(*beside[:2]) < 0.001 * SLIDE_MM
             assert abs(beside[2]) < 0.0005
             assert not env.info["overload"]
             assert env.info["errors"]["peak_force_n"] > 5.0
@@ -110,7 +110,7 @@ def test_one_that_presses_gently_goes_faster_in_the_hole() -> None:
     assert in_hole == pytest.approx(-5.0 - 3.0, abs=0.1)
 
 
-@pytest.mark.parametrize(("pressed_n", "deeper_mm"), [(10.0, 1.0), (12.5, 0.5), (15.0, 0), (30, 0)])
+@pytest.mark.parametrize(("pressed_n", "deeper_mm"), [(17.0, 1.0), (19.5, 0.5), (22.0, 0), (30, 0)])
 def test_the_harder_it_is_pressed_on_the_slower_it_goes_down(
     pressed_n: float, deeper_mm: float
 ) -> None:
