@@ -19,6 +19,9 @@ second target the demonstrator looks from lower, and to those that follow it goe
 It goes there in a plain posture, by the rule by which the policy's head is shown one (see
 `hvs_suite.cell.plain_postures`).
 
+Among obstacles it comes from above, as a policy can that does not see them (see
+`hvs_suite.datasets.flyover`).
+
 Over a surface of unknown slope it goes around, or leans, on its way down, so that the eye in the
 hand sees the slope (see `hvs_suite.datasets.leaning`).
 
@@ -34,16 +37,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from hvs_suite.datasets import flyover
 from hvs_suite.datasets.expert import Expert
 from hvs_suite.datasets.leaning import Straightening, raised, way_down
 from hvs_suite.datasets.planner import Planner
 from hvs_suite.tasks.shared.family import GOAL_UNSEEN
 from hvs_suite.tasks.shared.goal import Goal
+from hvs_suite.tasks.shared.obstacles import ObstaclesSpec
 from hvs_suite.tasks.shared.panels import PanelSpec
 from hvs_suite.tasks.shared.peg_and_bushing import WRENCH, PegSpec
 from hvs_suite.tasks.shared.spec import CAMERA_NAMES
 
 if TYPE_CHECKING:
+    from hvs_suite.cell.solid import Solid
     from hvs_suite.tasks.shared.environment import Environment
 
 FloatArray = npt.NDArray[np.float64]
@@ -83,7 +89,10 @@ class Demonstrator(Expert):
         self._near_planner = Planner(
             self._period_s, embodiment=spec.embodiment, clearance_m=CLEARANCE_M
         )
+        self._among_obstacles = isinstance(spec, ObstaclesSpec) and spec.n_obstacles[1] > 0
         self._looks_down = spec.eth_position_noise_m > 0 or spec.eth_rotation_noise_deg > 0
+        self._way: tuple[tuple[Solid, ...], bytes] = (), b""
+        self._is_way_free = False
         self.reset()
 
     def reset(self) -> None:
@@ -119,6 +128,10 @@ class Demonstrator(Expert):
             ahead = self._planner.towards_posture(q, velocity, self._next_look(q))
             if ahead is not None:
                 return ahead
+        if self._flies_over() and flyover.is_low(self._env.goal(), self._env.tip()):
+            ahead = self._planner.towards_posture(q, velocity, flyover.UPRIGHT_RAD)
+            if ahead is not None:
+                return ahead
         spec, goal = self._env.spec, self._goal_in(0.0)
         if isinstance(spec, PegSpec) and goal.standoff_m < 0.0:
             pressed_n = -float(self._env.privileged()[WRENCH][2]) if self._unseen().any() else None
@@ -140,12 +153,28 @@ class Demonstrator(Expert):
     def _goal_in(self, ahead_s: float) -> Goal:
         goal = super()._goal_in(ahead_s)
         goal = dataclasses.replace(goal, target=goal.target - self._unseen())
+        if self._flies_over():
+            over = flyover.next_place(goal, self._env.tip())
+            if over is not goal:
+                return over
         if self._has_seen_closely:
             return goal
         spec, height = self._env.spec, LOOK_DOWN_M[self._n_compared]
         if isinstance(spec, PanelSpec):
             return way_down(spec).above(goal, height)
         return raised(goal, height)
+
+    def _flies_over(self) -> bool:
+        """Whether something may stand around, and the way over it is free."""
+        if not self._among_obstacles:
+            return False
+        solids, goal = self._env.obstacles, self._env.goal()
+        key = solids, goal.position.tobytes()
+        if key != self._way:
+            self._way = key
+            over = raised(goal, flyover.OVER_M)
+            self._is_way_free = self._planner.is_free_by(flyover.UPRIGHT_RAD, over, goal)
+        return self._is_way_free
 
     def _unseen(self) -> FloatArray:
         """How far the goal is from where the pictures show it, (3,) m."""

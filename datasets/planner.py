@@ -66,6 +66,8 @@ _KEPT_ROADMAPS = 4
 _MAX_ESCAPES = 4
 _MAX_FLANGE_SPEED_M_S = 2.5
 _PATH_STEP_S = 0.02
+_STEP_RAD = 0.06
+"""Between postures of a way that are tried."""
 _DISTINCT_RAD = 0.2
 # Ruckig fails on some targets that braking reaches exactly; a target beside them works.
 _NUDGES_RAD = (0.0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3)
@@ -238,6 +240,33 @@ class Planner:
         if self._least_clearance(motion, CLEARANCE_M) < CLEARANCE_M:
             return None
         return self._point_ahead(motion)
+
+    def is_free_by(self, start: FloatArray, over: Goal, goal: Goal) -> bool:
+        """Whether the arm gets straight from a posture to above a goal, and down from there.
+
+        Args:
+            start: Where the arm is at rest, (7,) rad.
+            over: The place.
+            goal: Where the flange has to be in the end, in the posture of the place.
+        """
+        self._look_around(start, goal)
+        above, there = (
+            self._kinematics.goal_shapes(each.position, each.normal, self._swivels)
+            for each in (over, goal)
+        )
+        if len(above) != len(there):
+            return False
+        usable = _within_ranges(above) & _within_ranges(there)
+        above[:, 6] = there[:, 6] = start[6]
+        return any(
+            self._is_straight_free(start, on_way) and self._is_straight_free(on_way, end)
+            for on_way, end in zip(above[usable], there[usable], strict=True)
+        )
+
+    def _is_straight_free(self, one: FloatArray, other: FloatArray) -> bool:
+        count = 2 + int(np.abs(other - one).max() / _STEP_RAD)
+        ways = np.linspace(one, other, count)
+        return all(self._clearance(q) >= self._wanted_m for q in ways[::-1])
 
     def follow(
         self,

@@ -87,6 +87,9 @@ class CellModel:
         eih_rotation: Its optical axes there as columns, (3, 3).
         look_out_rad: Posture in which the arm hides nothing from the eye to hand, (7,) rad; None
             for a head that is not shown the way there.
+        over_m: From how far above the goal the arm comes down where something stands around (m):
+            the head is shown the plain posture there, and the way to the upright arm. None where
+            nothing does.
     """
 
     period_s: float
@@ -99,6 +102,7 @@ class CellModel:
     eih_origin: tuple[float, ...]
     eih_rotation: tuple[tuple[float, ...], ...]
     look_out_rad: tuple[float, ...] | None = None
+    over_m: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -259,9 +263,8 @@ class BeliefNetwork(nn.Module):
         self.lead_s = nn.Parameter(torch.tensor(0.1))
         self.feedback = nn.Parameter(torch.zeros(2))
         n_proposals = 1 + n_ways
-        if cell.look_out_rad is not None:
-            n_proposals += 1
-            way_width += 2 * N_JOINTS
+        n_proposals += len(self._fixed_postures)
+        way_width += 2 * N_JOINTS * len(self._fixed_postures)
         full = width + way_width + N_JOINTS * n_proposals
         last = nn.Linear(hidden, N_JOINTS + 1 + n_proposals)
         with torch.no_grad():
@@ -546,8 +549,8 @@ class BeliefNetwork(nn.Module):
         if self._sees_slopes:
             turn = scale * torch.sinh(guided[:, 9:].clamp(-bound, bound))
             proposals = [proposal + F.pad(turn, (N_JOINTS - 1, 0)) for proposal in proposals]
-        if self.cell.look_out_rad is not None:
-            turns = joints.new_tensor(self.cell.look_out_rad) - joints
+        for posture in self._fixed_postures:
+            turns = joints.new_tensor(posture) - joints
             gone = arm.along_way(turns, velocity, ahead_s, together=False)
             step = gone + joints - set_point
             proposals.append(step)
@@ -586,7 +589,7 @@ class BeliefNetwork(nn.Module):
         """
         tool, standoff = self.cell.tool_length_m, self.belief.standoff.float()
         target = goal - standoff * normal
-        over = [goal + (height + tool) * normal for height in HEIGHTS_M]
+        over = [goal + (height + tool) * normal for height in self._heights_m]
         facings = [(normal, over)]
         if self._sees_slopes:
             leaning = _leaning(normal, ARRIVES_LEANING * F.normalize(target[:, :2], dim=1))
@@ -600,6 +603,19 @@ class BeliefNetwork(nn.Module):
             else:
                 ways += [arm.way_to_posture(joints, place, facing) for place in over]
         return ways
+
+    @property
+    def _heights_m(self) -> tuple[float, ...]:
+        """Above the goal, along its normal: the plain postures that the head is shown."""
+        over_m = self.cell.over_m
+        return HEIGHTS_M if over_m is None else (*HEIGHTS_M[:-1], over_m)
+
+    @property
+    def _fixed_postures(self) -> list[tuple[float, ...]]:
+        """Postures to which the head is shown the way wherever the goal is, (7,) rad each."""
+        look_out = self.cell.look_out_rad
+        upright = [] if self.cell.over_m is None else [(0.0,) * N_JOINTS]
+        return upright if look_out is None else [look_out, *upright]
 
     @property
     def _sees_slopes(self) -> bool:

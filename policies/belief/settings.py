@@ -49,6 +49,7 @@ class Cell(pydantic.BaseModel):
     eih_origin: Place
     eih_rotation: Axes
     look_out_rad: tuple[Angle, Angle, Angle, Angle, Angle, Angle, Angle] | None = None
+    over_m: Annotated[float, pydantic.Field(strict=True, gt=0.0, le=1.0)] | None = None
 
     @pydantic.field_validator("eth_rotation", "eih_rotation")
     @classmethod

@@ -9,6 +9,7 @@ import torch.nn.functional as F  # noqa: N812
 
 import hvs_suite
 from hvs_suite.datasets.features import STATE, observed_part
+from hvs_suite.datasets.flyover import OVER_M
 from hvs_suite.datasets.looking import Demonstrator
 from hvs_suite.policies.belief import arm
 from hvs_suite.policies.belief.belief import PLACE, TILT
@@ -41,6 +42,36 @@ def test_an_arm_that_sees_nothing_is_shown_the_way_to_where_it_looks_from() -> N
         time_step = env.step(action[0].numpy())
         steps += 1
     assert steps > 3
+
+
+def test_among_obstacles_the_head_is_shown_the_way_up_and_over_and_down() -> None:
+    env = hvs_suite.load("clutter-obstacles", split="dev", observations="state")
+    cell = cell_model(env.spec)
+    assert cell.over_m == OVER_M
+    assert cell_model(hvs_suite.TASKS["clutter-choice"]).over_m is None
+    network = BeliefNetwork(Shape({"eih": (3, 64), "eth": (3, 64)}, hidden=8), cell)
+    demonstrator = Demonstrator(env)
+    network.belief.standoff.fill_(env.spec.standoff_m)
+    unseen = {n: torch.zeros(1, SIGHTING_SIZE) for n in network.shape.cameras}
+    shown = []
+    for scenario in range(3):
+        time_step = env.reset(scenario=scenario)
+        goal, memory = env.goal(), network.start(1)
+        demonstrator.reset()
+        while np.linalg.norm(env.tip().position - goal.position) > 0.05:
+            state = torch.from_numpy(observed_part(env.spec, time_step.observation, env)[STATE])
+            action = torch.from_numpy(np.asarray(demonstrator.label(), np.float32))[None]
+            with torch.no_grad():
+                memory = network.remember(memory, unseen, state[None, :7])
+                memory[:, PLACE] = torch.tensor(goal.target)
+                proposals = network.decide(memory, unseen, state[None]).proposals[0]
+            label = network.encode_label(action, memory)[0]
+            off = (network.to_step(proposals) - network.to_step(label)).abs().amax(dim=1)
+            shown.append(float(off.min()))
+            memory = network.commanded(memory, action)
+            time_step = env.step(action[0].numpy())
+    assert len(shown) > 30
+    assert np.mean(np.array(shown) < 0.01) > 0.8
 
 
 def test_a_head_that_sees_slopes_is_shown_the_way_to_where_the_tool_leans() -> None:
