@@ -12,6 +12,8 @@ import numpy.typing as npt
 
 from hvs_suite.datasets.leaning import raised
 from hvs_suite.tasks.shared.goal import Goal, Tip
+from hvs_suite.tasks.shared.obstacles import ObstaclesSpec
+from hvs_suite.tasks.shared.spec import Spec
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -27,6 +29,16 @@ _FAR_HIGH_M, _NEAR_HIGH_M = 0.60, 0.24
 """How high above the goal it rises (m): far from the line above it, and `_RISES_BESIDE_M` from it.
 Falling from the one to the other, the bound leaves room for the way over."""
 _FAR_M = 0.4
+"""So much farther from the line than `_RISES_BESIDE_M` it rises highest (m)."""
+
+
+def leads_over(spec: Spec) -> bool:
+    """Whether anything may stand around in a task, so that its demonstrations come this way.
+
+    Args:
+        spec: Parameters of the task.
+    """
+    return isinstance(spec, ObstaclesSpec) and spec.n_obstacles[1] > 0
 
 
 def next_place(goal: Goal, tip: Tip) -> Goal:

@@ -43,7 +43,6 @@ from hvs_suite.datasets.leaning import Straightening, raised, way_down
 from hvs_suite.datasets.planner import Planner
 from hvs_suite.tasks.shared.family import GOAL_UNSEEN
 from hvs_suite.tasks.shared.goal import Goal
-from hvs_suite.tasks.shared.obstacles import ObstaclesSpec
 from hvs_suite.tasks.shared.panels import PanelSpec
 from hvs_suite.tasks.shared.peg_and_bushing import WRENCH, PegSpec
 from hvs_suite.tasks.shared.spec import CAMERA_NAMES
@@ -89,7 +88,6 @@ class Demonstrator(Expert):
         self._near_planner = Planner(
             self._period_s, embodiment=spec.embodiment, clearance_m=CLEARANCE_M
         )
-        self._among_obstacles = isinstance(spec, ObstaclesSpec) and spec.n_obstacles[1] > 0
         self._looks_down = spec.eth_position_noise_m > 0 or spec.eth_rotation_noise_deg > 0
         self._way: tuple[tuple[Solid, ...], bytes] = (), b""
         self._is_way_free = False
@@ -166,7 +164,7 @@ class Demonstrator(Expert):
 
     def _flies_over(self) -> bool:
         """Whether something may stand around, and the way over it is free."""
-        if not self._among_obstacles:
+        if not flyover.leads_over(self._env.spec):
             return False
         solids, goal = self._env.obstacles, self._env.goal()
         key = solids, goal.position.tobytes()

@@ -27,7 +27,7 @@ from hvs_suite.cell import robot
 from hvs_suite.cell.kinematics import Kinematics, away_from_stops, circle, kinematics
 from hvs_suite.cell.plain_postures import CHOSEN_ABOVE_M, ELBOWS_RAD, soonest_first
 from hvs_suite.cell.solid import Solid, obstacle_distance
-from hvs_suite.datasets.roadmap import Roadmap
+from hvs_suite.datasets.roadmap import Roadmap, is_straight_clear
 from hvs_suite.embodiment import BARE_ARM, Embodiment
 from hvs_suite.tasks.shared.goal import Goal
 
@@ -66,8 +66,6 @@ _KEPT_ROADMAPS = 4
 _MAX_ESCAPES = 4
 _MAX_FLANGE_SPEED_M_S = 2.5
 _PATH_STEP_S = 0.02
-_STEP_RAD = 0.06
-"""Between postures of a way that are tried."""
 _DISTINCT_RAD = 0.2
 # Ruckig fails on some targets that braking reaches exactly; a target beside them works.
 _NUDGES_RAD = (0.0, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3)
@@ -246,8 +244,8 @@ class Planner:
 
         Args:
             start: Where the arm is at rest, (7,) rad.
-            over: The place.
-            goal: Where the flange has to be in the end, in the posture of the place.
+            over: Where it has to be above the goal.
+            goal: Where it has to be in the end, with elbow and shape as above.
         """
         self._look_around(start, goal)
         above, there = (
@@ -259,14 +257,10 @@ class Planner:
         usable = _within_ranges(above) & _within_ranges(there)
         above[:, 6] = there[:, 6] = start[6]
         return any(
-            self._is_straight_free(start, on_way) and self._is_straight_free(on_way, end)
+            is_straight_clear(self._clearance, start, on_way, self._wanted_m)
+            and is_straight_clear(self._clearance, on_way, end, self._wanted_m)
             for on_way, end in zip(above[usable], there[usable], strict=True)
         )
-
-    def _is_straight_free(self, one: FloatArray, other: FloatArray) -> bool:
-        count = 2 + int(np.abs(other - one).max() / _STEP_RAD)
-        ways = np.linspace(one, other, count)
-        return all(self._clearance(q) >= self._wanted_m for q in ways[::-1])
 
     def follow(
         self,

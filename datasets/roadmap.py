@@ -125,17 +125,10 @@ class Roadmap:
         """Whether the straight motion between two nodes is clear, and both are; tried once."""
         key = min(one, other) * len(self.nodes) + max(one, other)
         if key not in self._is_free:
-            self._is_free[key] = self._is_straight_clear(self.nodes[one], self.nodes[other])
+            self._is_free[key] = is_straight_clear(
+                self._clearance, self.nodes[one], self.nodes[other], CLEARANCE_M
+            )
         return self._is_free[key]
-
-    def _is_straight_clear(self, here: FloatArray, there: FloatArray) -> bool:
-        count = 1 + int(np.abs(there - here).max() / _STEP_RAD)
-        # Ends and middle first: what is blocked shows soon.
-        shares = np.linspace(0.0, 1.0, count + 1)
-        order = np.argsort([_bits(number) for number in range(count + 1)], kind="stable")
-        return all(
-            self._clearance(here + share * (there - here)) >= CLEARANCE_M for share in shares[order]
-        )
 
     def _update(self) -> None:
         """Times to go to the goal from every node, and the next node on the way."""
@@ -152,6 +145,24 @@ class Roadmap:
         self._to_go: FloatArray = to_go[:n]
         self._next = np.where(before[:n] == n, -1, before[:n])
         self._next[~np.isfinite(self._to_go)] = -1
+
+
+def is_straight_clear(
+    clearance: Clearance, here: FloatArray, there: FloatArray, least_m: float
+) -> bool:
+    """Whether the straight joint motion from one posture to another keeps clear, both included.
+
+    Args:
+        clearance: Of the scene.
+        here: Joint angles (7,) rad.
+        there: Joint angles (7,) rad.
+        least_m: What it has to keep (m).
+    """
+    count = 1 + int(np.abs(there - here).max() / _STEP_RAD)
+    # Ends and middle first: what is blocked shows soon.
+    shares = np.linspace(0.0, 1.0, count + 1)
+    order = np.argsort([_bits(number) for number in range(count + 1)], kind="stable")
+    return all(clearance(here + share * (there - here)) >= least_m for share in shares[order])
 
 
 def _bits(number: int) -> int:

@@ -5,11 +5,10 @@ import math
 import numpy as np
 
 from hvs_suite.cell.cameras import look_at
-from hvs_suite.datasets.flyover import OVER_M
+from hvs_suite.datasets.flyover import OVER_M, leads_over
 from hvs_suite.datasets.looking import LOOK_OUT_RAD
 from hvs_suite.datasets.planner import LEAD_S
 from hvs_suite.policies.belief.network import CellModel
-from hvs_suite.tasks.shared.obstacles import ObstaclesSpec
 from hvs_suite.tasks.shared.spec import Spec
 
 _OPTICAL = np.diag([1.0, -1.0, -1.0])
@@ -21,7 +20,6 @@ def cell_model(spec: Spec) -> CellModel:
     Args:
         spec: Its parameters.
     """
-    among_obstacles = isinstance(spec, ObstaclesSpec) and spec.n_obstacles[1] > 0
     eth = look_at(spec.eth_position_m, spec.eth_look_at_m) @ _OPTICAL
     axes, place = spec.embodiment.hand_eye
     return CellModel(
@@ -38,5 +36,5 @@ def cell_model(spec: Spec) -> CellModel:
         eih_origin=tuple(place.tolist()),
         eih_rotation=tuple(map(tuple, axes.tolist())),
         look_out_rad=tuple(LOOK_OUT_RAD.tolist()),
-        over_m=OVER_M if among_obstacles else None,
+        over_m=OVER_M if leads_over(spec) else None,
     )
