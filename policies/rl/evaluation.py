@@ -32,6 +32,7 @@ class Evaluation:
         episodes: Episodes played.
         episode_return: Undiscounted sum of rewards.
         length: Control steps.
+        outside: Control steps that end outside the tolerances.
         success_rate: Share that reached the goal.
         collision_rate: Share that ended in a forbidden contact.
         errors: The task's metrics at the end of the episode.
@@ -42,6 +43,7 @@ class Evaluation:
     episodes: int
     episode_return: float
     length: float
+    outside: float
     success_rate: float
     collision_rate: float
     errors: dict[str, float]
@@ -60,8 +62,9 @@ class Evaluation:
         """The figures as one line."""
         errors = ", ".join(f"{name} {value:.3g}" for name, value in self.errors.items())
         return (
-            f"return {self.episode_return:.2f} in {self.length:.1f} steps, success "
-            f"{100 * self.success_rate:.0f} %, collisions {100 * self.collision_rate:.0f} %, "
+            f"return {self.episode_return:.2f} in {self.length:.1f} steps, "
+            f"{self.outside:.1f} outside, success {100 * self.success_rate:.0f} %, "
+            f"collisions {100 * self.collision_rate:.0f} %, "
             f"{errors}"
         )
 
@@ -100,13 +103,16 @@ class Evaluator:
             on_episode: Called with the number of episodes played.
         """
         rewards: list[float] = []
+        outside = 0
         played = []
+
+        def note(*step: Any) -> None:
+            nonlocal outside
+            rewards.append(float(step[3].reward))
+            outside += not self._env.info["n_inside"]
+
         for scenario in range(self.episodes):
-            played.append(
-                run_episode(
-                    self._env, policy, scenario, lambda *step: rewards.append(float(step[3].reward))
-                )
-            )
+            played.append(run_episode(self._env, policy, scenario, note))
             if on_episode is not None:
                 on_episode(scenario + 1)
         if clip is not None:
@@ -118,6 +124,7 @@ class Evaluator:
             episodes=len(played),
             episode_return=sum(rewards) / len(played),
             length=float(np.mean([episode.steps for episode in played])),
+            outside=outside / len(played),
             success_rate=float(np.mean([episode.success for episode in played])),
             collision_rate=float(np.mean([episode.collision for episode in played])),
             errors={
@@ -160,13 +167,15 @@ def write_evaluations(path: Path, evaluations: list[Evaluation]) -> None:
 def standing(evaluation: Evaluation) -> tuple[float, float]:
     """What evaluations of the same scenes are compared by: success, and of equals haste.
 
+    Haste is about the steps outside, because some tasks last as long whatever is done.
+
     Args:
         evaluation: Of some state of a run.
 
     Returns:
         More is better.
     """
-    return evaluation.success_rate, -evaluation.length
+    return evaluation.success_rate, -evaluation.outside
 
 
 def fallen(evaluations: Sequence[Evaluation]) -> bool:

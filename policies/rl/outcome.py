@@ -39,7 +39,9 @@ class Progress:
             return ""
         parts = [f"step {self.env_steps}", f"{self.updates} updates"]
         if self.stage == "training":
-            parts += [f"{self.env_steps_per_s:.1f} steps/s", f"{self.seconds_left:.0f} s left"]
+            parts.append(f"{self.env_steps_per_s:.1f} steps/s")
+        if self.stage == "training" and not math.isnan(self.seconds_left):
+            parts.append(f"{self.seconds_left:.0f} s left")
         if not math.isnan(self.episode_return):
             parts.append(f"return {self.episode_return:.2f}")
         if self.evaluation is not None:

@@ -44,10 +44,10 @@ def draw_rl_run(training: Path, evaluations: Sequence[Evaluation]) -> Path:
     )  # fmt: skip
     success.set(ylim=(0.0, 102.0), ylabel="solved (%), with Wilson's 95 % interval")
     success.set_title(f"evaluations, {evaluations[-1].episodes} episodes each")
-    lengths = [each.length for each in evaluations]
-    haste.plot(steps, lengths, color="tab:green", marker="o", markersize=3, linewidth=1.2)
+    outside = [each.outside for each in evaluations]
+    haste.plot(steps, outside, color="tab:green", marker="o", markersize=3, linewidth=1.2)
     haste.set(ylabel="control steps, mean")
-    haste.set_title("length of their episodes")
+    haste.set_title("outside the tolerances in an episode")
     for name, label in ROLLOUT.items():
         if name in curves:
             playing.plot(

@@ -73,7 +73,7 @@ def moved(base, tmp_path_factory):
     with torch.no_grad():
         network.residual.layers[-2].weight.normal_()
     folder = tmp_path_factory.mktemp("moved")
-    write_folded(base, network.residual, SMALL, folder, hvs_suite.TASKS[TASK])
+    write_folded(base, network.residual, network.shape, folder, hvs_suite.TASKS[TASK])
     return folder
 
 
@@ -373,7 +373,9 @@ def test_a_fine_tuned_policy_is_shipped_like_any_other(whole, tmp_path):
      ([0.9, 0.6, 0.88], False)],
 )  # fmt: skip
 def test_success_has_fallen_where_chance_does_not_explain_it(rates, expected):
-    evaluations = [Evaluation(i, i, 100, 0.0, 1.0, rate, 0.0, {}) for i, rate in enumerate(rates)]
+    evaluations = [
+        Evaluation(i, i, 100, 0.0, 1.0, 1.0, rate, 0.0, {}) for i, rate in enumerate(rates)
+    ]
     assert fallen(evaluations) is expected
 
 
@@ -382,7 +384,7 @@ def pretend(monkeypatch, rates):
     coming = iter(rates)
 
     def evaluate(self, policy, env_steps, updates, clip=None, on_episode=None):
-        return Evaluation(env_steps, updates, 100, 0.0, 1.0, next(coming), 0.0, {})
+        return Evaluation(env_steps, updates, 100, 0.0, 1.0, 1.0, next(coming), 0.0, {})
 
     monkeypatch.setattr("hvs_suite.policies.rl.evaluation.Evaluator.evaluate", evaluate)
 
