@@ -38,6 +38,7 @@ COMMANDS = {
     "fetch": "hvs_suite.cli.fetch:Fetch",
     "pretrain": "hvs_suite.cli.pretrain:Pretrain",
     "finetune": "hvs_suite.cli.finetune:Finetune",
+    "finetune-way": "hvs_suite.cli.finetune_way:FinetuneWay",
     "train-sac": "hvs_suite.cli.train_sac:TrainSac",
     "ship": "hvs_suite.cli.ship:Ship",
     "evaluate": "hvs_suite.cli.evaluate:Evaluate",

@@ -54,10 +54,11 @@ class CompiledBelief:
     """Plays a `BeliefNetwork`, one observation at a time.
 
     Args:
-        network: In evaluation mode; later changes of its weights are not noticed.
+        network: In evaluation mode.
+        is_frozen: Whether its weights stay as they are; otherwise later changes are noticed.
     """
 
-    def __init__(self, network: BeliefNetwork) -> None:
+    def __init__(self, network: BeliefNetwork, *, is_frozen: bool = True) -> None:
         shape = network.shape
         self._cameras = tuple(shape.cameras)
         self._start = network.start(1)
@@ -71,7 +72,7 @@ class CompiledBelief:
             torch.zeros(1, shape.n_goals),
             torch.zeros(1, shape.n_felt),
         )
-        self._frozen = _compiled(_Acts(network), example)
+        self._compiled = _compiled(_Acts(network), example, is_frozen=is_frozen)
 
     def __call__(
         self,
@@ -93,7 +94,7 @@ class CompiledBelief:
         Returns:
             As `act`.
         """
-        action, memory = self._frozen(
+        action, memory = self._compiled(
             tuple(images[name] for name in self._cameras),
             state,
             self._start if memory is None else memory,
@@ -223,8 +224,8 @@ class _Responds(nn.Module):
         return action, network.commanded(memory, action)
 
 
-def _compiled(module: nn.Module, example: tuple[Any, ...]) -> Any:
-    """A module, traced and frozen."""
+def _compiled(module: nn.Module, example: tuple[Any, ...], *, is_frozen: bool = True) -> Any:
+    """A module, traced, and frozen if it may be."""
     with torch.no_grad(), warnings.catch_warnings():
         # Tracing holds for batches of one alone, which is all it is made for; and newer Python
         # will want another compiler, which needs a C++ one installed.
@@ -232,7 +233,8 @@ def _compiled(module: nn.Module, example: tuple[Any, ...]) -> Any:
         traced = torch.jit.trace(  # type: ignore[no-untyped-call]
             module.eval(), example, check_trace=False
         )
-        frozen = torch.jit.freeze(traced)
+        if is_frozen:
+            traced = torch.jit.freeze(traced)
         for _ in range(_WARM_UP_CALLS):
-            frozen(*example)
-    return frozen
+            traced(*example)
+    return traced

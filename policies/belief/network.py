@@ -36,6 +36,7 @@ from hvs_suite.policies.belief.belief import (
     Ray,
     View,
 )
+from hvs_suite.policies.belief.choice import Choice
 from hvs_suite.policies.belief.colour_slope import ColourSlopeEye
 from hvs_suite.policies.belief.eye import LOG_DIAMETER, UV, VISIBLE, Eye, Seen
 from hvs_suite.policies.belief.foresight import Foresight
@@ -122,6 +123,8 @@ class Shape:
             (m).
         residual_reach_m: How far from the believed goal the tip may be for the goal to be moved
             (m).
+        choice_beyond_m: How far from the believed goal what policy search has found shifts the
+            choice among the proposals (m); None without it.
         reads_positions: Whether measured joint positions are read; without them the network knows
             where the arm starts, and from there on where it has sent it.
         reads_velocities: Whether measured joint velocities are read; without them the network
@@ -155,6 +158,7 @@ class Shape:
     residual_hidden: int = 0
     residual_step_m: tuple[float, float] = (0.0004, 0.001)
     residual_reach_m: float = 0.02
+    choice_beyond_m: float | None = None
     reads_positions: bool = True
     reads_velocities: bool = True
     slopes: tuple[str, ...] = ()
@@ -288,6 +292,9 @@ class BeliefNetwork(nn.Module):
                 shape.residual_reach_m,
                 cell.period_s,
             )
+        self.choice: Choice | None = None
+        if shape.choice_beyond_m is not None:
+            self.choice = Choice(1 + n_proposals, shape.choice_beyond_m)
         self.foresight: Foresight | None = None
         begin = MEMORY_SIZE if self.residual is None else FELT.stop
         self._past = slice(begin, begin)
@@ -563,13 +570,16 @@ class BeliefNetwork(nn.Module):
                 out.split([N_JOINTS, 1, len(proposals)], dim=1), OUT_BOUNDS, strict=True
             )
         )
+        far = (goal - here.position).norm(dim=1, keepdim=True)
+        if self.choice is not None:
+            shift = self.choice(far)
+            is_corrected, weights = is_corrected + shift[:, :1], weights + shift[:, 1:]
         if self._sees_slopes:
             weights = SURE * weights
         # Weights and gate can become nearly whole: near the goal one proposal is right as it is.
         mean = (weights.softmax(dim=1)[:, :, None] * torch.stack(proposals, dim=1)).sum(dim=1)
         corrected = torch.sigmoid(is_corrected)
         if self.shape.corrects_within_m is not None:
-            far = (goal - here.position).norm(dim=1, keepdim=True)
             corrected = corrected * (2.0 - far / self.shape.corrects_within_m).clamp(0.0, 1.0)
         total = torch.asinh(mean / scale) + corrected * correction
         return Decision(total, torch.stack(said, dim=1), weights)

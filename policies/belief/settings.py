@@ -12,6 +12,7 @@ import numpy as np
 import pydantic
 
 from hvs_suite.datasets.features import IMAGES, OBSERVATION, STATE
+from hvs_suite.policies.belief.choice import FAR_M
 from hvs_suite.policies.belief.network import N_JOINTS, BeliefNetwork, CellModel, Shape
 
 CAMERAS = ("eih", "eth")
@@ -89,6 +90,7 @@ class Settings(pydantic.BaseModel):
         residual_hidden: See `Shape`.
         residual_step_m: See `Shape`.
         residual_reach_m: See `Shape`.
+        choice_beyond_m: See `Shape`.
         reads_positions: See `Shape`.
         reads_velocities: See `Shape`.
         slopes: See `Shape`.
@@ -115,6 +117,7 @@ class Settings(pydantic.BaseModel):
     residual_reach_m: Annotated[float, pydantic.Field(strict=True, gt=0.0, le=10.0)] = (
         Shape.residual_reach_m
     )
+    choice_beyond_m: Annotated[float, pydantic.Field(strict=True, gt=0.0, lt=FAR_M)] | None = None
     reads_positions: Annotated[bool, pydantic.Field(strict=True)] = True
     reads_velocities: Annotated[bool, pydantic.Field(strict=True)] = True
     slopes: tuple[Literal["eih", "eth"], ...] = ()
@@ -176,6 +179,7 @@ class Settings(pydantic.BaseModel):
             residual_hidden=self.residual_hidden,
             residual_step_m=self.residual_step_m,
             residual_reach_m=self.residual_reach_m,
+            choice_beyond_m=self.choice_beyond_m,
             reads_positions=self.reads_positions,
             reads_velocities=self.reads_velocities,
             slopes=self.slopes,

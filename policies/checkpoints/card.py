@@ -168,11 +168,23 @@ def _imitation_rows(trained: Mapping[str, Any], outcome: Mapping[str, Any]) -> d
 
 
 def _rl_rows(settings: Mapping[str, Any], outcome: Mapping[str, Any]) -> dict[str, str]:
-    """What `finetune` did."""
-    return {
+    """What `finetune` or `finetune-way` did."""
+    fine_tuned = {
         "fine-tuned from": f"a pretrained policy, weights `{settings['base'][:12]}`",
+    }
+    played = f"{outcome['env_steps']:,} environment steps"
+    if "population" in settings:
+        return fine_tuned | {
+            "reinforcement learning": "policy search (CMA-ES) on how the head chooses among its "
+            f"proposals far from the goal: {outcome['n_parameters']} numbers, {played}, "
+            f"{outcome['step']} generations of {settings['population']} candidates in "
+            f"{settings['scenes']} scenes",
+            "supervision in training": "how many control steps end outside the tolerances; no "
+            "expert, and none of it is an input",
+        }
+    return fine_tuned | {
         "reinforcement learning": "TD3 on a residual that moves the believed goal, of "
-        f"{outcome['n_parameters']:,} parameters, {outcome['env_steps']:,} environment steps, "
+        f"{outcome['n_parameters']:,} parameters, {played}, "
         f"{outcome['step']:,} updates of "
         f"{settings['batch_size']} transitions",
         "supervision in training": "the task's sparse reward, and critics that see the simulator's "
@@ -184,8 +196,9 @@ def _time(outcome: Mapping[str, Any], trained: Mapping[str, Any], was_fine_tuned
     """Hours of playing and learning; imitation counts its playing apart."""
     hours = (outcome["train_s"] + outcome.get("play_s", 0.0)) / 3600.0
     if was_fine_tuned:
-        players = trained["settings"]["environments"]
-        where = f"{_count(players, 'process', 'processes')} playing while one learns"
+        learns = "environments" in trained["settings"]
+        players = trained["settings"]["environments"] if learns else trained["players"]
+        where = f"{_count(players, 'process', 'processes')} playing" + learns * " while one learns"
         return f"{hours:.2f} h, {where}; evaluations not counted"
     learning = _count(trained["threads"], "thread", "threads")
     return f"{hours:.2f} h, learning on {learning}; recording not counted"

@@ -38,6 +38,8 @@ class HvsConfig(PreTrainedConfig):
         residual_step_m: The most that it moves the goal in a step: sideways, and along the normal
             (m).
         residual_reach_m: How far from the believed goal it does (m).
+        choice_beyond_m: How far from the believed goal what policy search has found shifts the
+            choice among the head's proposals (m); None without it.
         reads_positions: Whether it reads measured joint positions, see `Shape`.
         reads_velocities: Whether it reads measured joint velocities.
         slopes: Cameras whose eyes tell slopes, see `Shape`.
@@ -75,6 +77,7 @@ class HvsConfig(PreTrainedConfig):
     residual_hidden: int = 0
     residual_step_m: tuple[float, float] = Shape.residual_step_m
     residual_reach_m: float = Shape.residual_reach_m
+    choice_beyond_m: float | None = None
     reads_positions: bool = True
     reads_velocities: bool = True
     slopes: tuple[str, ...] = ()

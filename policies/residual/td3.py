@@ -12,7 +12,6 @@ import copy
 import dataclasses
 import json
 import math
-import shutil
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -29,9 +28,10 @@ from hvs_suite.files import replacing
 from hvs_suite.policies.belief.residual import N_LENGTHS, Residual
 from hvs_suite.policies.catalogue import name_of
 from hvs_suite.policies.checkpoints.files import read_config
-from hvs_suite.policies.checkpoints.loading import CheckpointPolicy, check_fit, weights_digest
+from hvs_suite.policies.checkpoints.loading import check_fit, weights_digest
 from hvs_suite.policies.residual.critics import Critics
 from hvs_suite.policies.residual.folding import load_base, with_residual, write_folded
+from hvs_suite.policies.residual.keeping import evaluate_and_keep, is_due
 from hvs_suite.policies.residual.replay import Replay
 from hvs_suite.policies.residual.settings import Settings
 from hvs_suite.policies.residual.stage import PRIVILEGED, READ, MakeStage, Place
@@ -41,8 +41,6 @@ from hvs_suite.policies.rl.evaluation import (
     Evaluator,
     fallen,
     read_evaluations,
-    standing,
-    write_evaluations,
 )
 from hvs_suite.policies.rl.outcome import Outcome, Progress, check_run
 from hvs_suite.policies.rl.plot import draw_rl_run
@@ -127,7 +125,8 @@ def finetune(
         stack.enter_context(one_torch_thread())
         stack.enter_context(library_seeds(seed))
         evaluator = stack.enter_context(contextlib.closing(Evaluator(spec, options, eval_episodes)))
-        residual = with_residual(base, settings).residual
+        network = with_residual(base, settings)
+        residual = network.residual
         assert residual is not None
 
         # What learns and what remembers.
@@ -201,26 +200,17 @@ def finetune(
             share = budget.share(counts["env_steps"], counts["elapsed_s"])
 
             # Evaluate what would play, and keep the best of it.
-            evaluated = evaluations[-1].env_steps if evaluations else -eval_every
-            due = counts["env_steps"] // eval_every > evaluated // eval_every
-            if due or (share >= 1.0 and evaluated < counts["env_steps"]):
-                candidate = training / "candidate"
-                write_folded(policy, learner.average, settings, candidate, spec)
-                evaluation = evaluator.evaluate(
-                    CheckpointPolicy(candidate, spec),
-                    counts["env_steps"],
-                    counts["updates"],
-                    training / "clips" / f"{counts['env_steps']:010d}.mp4",
-                    lambda k: report("evaluating", k / evaluator.episodes),
-                )
-                evaluations.append(evaluation)
-                write_evaluations(training / "evaluations.json", evaluations)
-                figures = {f"eval/{k}": v for k, v in evaluation.figures().items()}
+            if is_due(evaluations, counts["env_steps"], eval_every, is_over=share >= 1.0):
+                evaluate_and_keep(
+                    lambda folder: write_folded(
+                        policy, learner.average, network.shape, folder, spec
+                    ),
+                    evaluator, evaluations, out, spec,
+                    env_steps=counts["env_steps"], updates=counts["updates"],
+                    on_share=lambda part: report("evaluating", part),
+                )  # fmt: skip
+                figures = {f"eval/{k}": v for k, v in evaluations[-1].figures().items()}
                 curves.add(figures, counts["env_steps"])
-                if standing(evaluation) == max(standing(each) for each in evaluations):
-                    for path in candidate.iterdir():
-                        with replacing(out / path.name) as temporary:
-                            shutil.copy(path, temporary)
                 last_checkpoint = -math.inf
 
             # Checkpoint.

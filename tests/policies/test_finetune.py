@@ -73,7 +73,7 @@ def moved(base, tmp_path_factory):
     with torch.no_grad():
         network.residual.layers[-2].weight.normal_()
     folder = tmp_path_factory.mktemp("moved")
-    write_folded(base, network.residual, SMALL, folder, hvs_suite.TASKS[TASK])
+    write_folded(base, network.residual, network.shape, folder, hvs_suite.TASKS[TASK])
     return folder
 
 
