@@ -14,8 +14,8 @@ class Players:
 
     Attributes:
         workers: Processes that play; the results are the same for any number. By default 1 (2 for
-            pretrain and study), or with --ray one for each core of the cluster, also for cores that
-            join it later.
+            pretrain, finetune-way and study), or with --ray one for each core of the cluster, also
+            for cores that join it later.
         ray: Play on a Ray cluster (docs/many-machines.md): auto for the one that this machine
             belongs to, an address such as 10.0.0.1:6379, or local for one of this machine alone.
     """
