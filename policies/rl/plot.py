@@ -1,19 +1,54 @@
 """A picture of an RL run: success and haste amid training, and what learned them."""
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from hvs_suite.files import replacing
 from hvs_suite.policies.rl.evaluation import Evaluation
 from hvs_suite.policies.training.plot import PICTURE, read_curves
 
-ROLLOUT = {"rollout/success_rate": "solved", "rollout/collision": "collided"}
-LOSSES = {
-    "train/critic_loss": "critics' loss",
-    "train/value": "mean value",
-    "train/residual": "residual, share of its bound",
-    "train/ent_coef": "temperature",
-}
+PERCENT = 100.0
+
+
+@dataclasses.dataclass(frozen=True)
+class _Group:
+    """Curves that share axes; drawn if the run has any of them."""
+
+    title: str
+    unit: str
+    labels: Mapping[str, str]
+    scale: float = 1.0
+
+
+GROUPS = (
+    _Group(
+        "while exploring",
+        "share of the last 100 episodes (%)",
+        {
+            "rollout/success_rate": "solved",
+            "rollout/success": "solved",
+            "rollout/collision": "collided",
+        },
+        PERCENT,
+    ),
+    _Group(
+        "candidates of a generation",
+        "control steps outside, and penalty",
+        {"rollout/outside": "mean", "rollout/outside of the best": "best"},
+    ),
+    _Group(
+        "learning",
+        "",
+        {
+            "train/critic_loss": "critics' loss",
+            "train/value": "mean value",
+            "train/residual": "residual, share of its bound",
+            "train/ent_coef": "temperature",
+            "train/spread": "standard deviation of the candidates",
+        },
+    ),
+)
 
 
 def draw_rl_run(training: Path, evaluations: Sequence[Evaluation]) -> Path:
@@ -32,8 +67,9 @@ def draw_rl_run(training: Path, evaluations: Sequence[Evaluation]) -> Path:
     from matplotlib.figure import Figure
 
     curves = read_curves(training / "tensorboard")
-    figure = Figure(figsize=(13.0, 3.4), layout="constrained")
-    success, haste, playing, learning = figure.subplots(1, 4)
+    drawn = [group for group in GROUPS if any(name in curves for name in group.labels)]
+    figure = Figure(figsize=(3.25 * (2 + len(drawn)), 3.4), layout="constrained")
+    success, haste, *further = figure.subplots(1, 2 + len(drawn))
     steps = [each.env_steps / 1000.0 for each in evaluations]
     rates = [100.0 * each.success_rate for each in evaluations]
     ranges = [each.interval for each in evaluations]
@@ -48,23 +84,18 @@ def draw_rl_run(training: Path, evaluations: Sequence[Evaluation]) -> Path:
     haste.plot(steps, outside, color="tab:green", marker="o", markersize=3, linewidth=1.2)
     haste.set(ylabel="control steps, mean")
     haste.set_title("outside the tolerances in an episode")
-    for name, label in ROLLOUT.items():
-        if name in curves:
-            playing.plot(
-                curves[name][0] / 1000.0, 100.0 * curves[name][1], label=label, linewidth=1.2
-            )
-    playing.set(ylim=(0.0, 102.0), ylabel="share of the last 100 episodes (%)")
-    playing.set_title("while exploring")
-    for name, label in LOSSES.items():
-        if name in curves:
-            learning.plot(curves[name][0] / 1000.0, curves[name][1], label=label, linewidth=1.2)
-    learning.set_title("learning")
-    for axes in (success, haste, playing, learning):
+    for axes, group in zip(further, drawn, strict=True):
+        for name, label in group.labels.items():
+            if name in curves:
+                played, values = curves[name]
+                axes.plot(played / 1000.0, group.scale * values, label=label, linewidth=1.2)
+        axes.set(ylabel=group.unit, title=group.title)
+        if group.scale == PERCENT:
+            axes.set(ylim=(0.0, 102.0))
+        axes.legend(frameon=False, fontsize=8)
+    for axes in (success, haste, *further):
         axes.set_xlabel("environment steps (thousands)")
         axes.grid(alpha=0.3)
-    for axes in (playing, learning):
-        if axes.lines:
-            axes.legend(frameon=False, fontsize=8)
     target = training / PICTURE
     with replacing(target) as temporary:
         figure.savefig(temporary, format="png", dpi=110)
