@@ -1,11 +1,10 @@
 """``hvs finetune``: a pretrained policy, made better by reinforcement learning."""
 
 import dataclasses
-import functools
 from pathlib import Path
 from typing import Literal
 
-from hvs_suite.cli.rl_session import show_run
+from hvs_suite.cli.rl_session import show_finetuning
 from hvs_suite.policies.residual.settings import Settings
 
 
@@ -76,25 +75,7 @@ class Finetune:
 
     def run(self) -> None:
         """Train, showing how it goes, and say what came of it."""
-        from hvs_suite import registry
-        from hvs_suite.policies.catalogue import checkpoint_folder
-
-        options = registry.find(self.task).options_from_text(self.option)
-        base = checkpoint_folder(self.policy, self.task)
-        chosen = {field.name for field in dataclasses.fields(Settings)}
-        settings = Settings(**{k: v for k, v in vars(self).items() if k in chosen})
         # Only now, because it imports torch.
         from hvs_suite.policies.residual.td3 import finetune
 
-        show_run(
-            functools.partial(finetune, base, self.task, self.out),
-            self.out,
-            minutes=self.minutes,
-            steps=self.steps,
-            seed=self.seed,
-            settings=settings,
-            options=options,
-            curriculum=self.curriculum,
-            eval_every=self.eval_every,
-            eval_episodes=self.eval_episodes,
-        )
+        show_finetuning(self, Settings, finetune, curriculum=self.curriculum)

@@ -1,11 +1,10 @@
 """``hvs finetune-way``: a pretrained policy, made to go to its goal sooner by policy search."""
 
 import dataclasses
-import functools
 from pathlib import Path
 
 from hvs_suite.cli.players import Players
-from hvs_suite.cli.rl_session import show_run
+from hvs_suite.cli.rl_session import show_finetuning
 from hvs_suite.policies.residual.way_settings import WaySettings
 
 
@@ -59,25 +58,7 @@ class FinetuneWay(Players):
 
     def run(self) -> None:
         """Search, showing how it goes, and say what came of it."""
-        from hvs_suite import registry
-        from hvs_suite.policies.catalogue import checkpoint_folder
-
-        options = registry.find(self.task).options_from_text(self.option)
-        base = checkpoint_folder(self.policy, self.task)
-        chosen = {field.name for field in dataclasses.fields(WaySettings)}
-        settings = WaySettings(**{k: v for k, v in vars(self).items() if k in chosen})
         # Only now, because it imports torch.
         from hvs_suite.policies.residual.search import search
 
-        show_run(
-            functools.partial(search, base, self.task, self.out),
-            self.out,
-            minutes=self.minutes,
-            steps=self.steps,
-            seed=self.seed,
-            settings=settings,
-            options=options,
-            workers=self.players(local=2),
-            eval_every=self.eval_every,
-            eval_episodes=self.eval_episodes,
-        )
+        show_finetuning(self, WaySettings, search, workers=self.players(local=2))

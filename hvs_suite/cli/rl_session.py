@@ -1,6 +1,8 @@
 """What the commands that learn by reward share: a budget by default, and how a run is shown."""
 
+import functools
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +12,42 @@ if TYPE_CHECKING:
     from hvs_suite.policies.rl.outcome import Outcome
 
 DEFAULT_MINUTES = 40.0
+
+
+def show_finetuning(
+    command: Any, settings: type[Any], train: Callable[..., "Outcome"], **options: Any
+) -> None:
+    """Fine-tune a policy as a command says.
+
+    Args:
+        command: With the fields of the settings, and ``policy``, ``task``, ``out``, ``option``,
+            ``minutes``, ``steps``, ``seed``, ``eval_every`` and ``eval_episodes``.
+        settings: Class of the method's settings.
+        train: Takes base, task, folder, settings, and what `show_run` says.
+        **options: What else it takes.
+    """
+    from hvs_suite import registry
+    from hvs_suite.policies.catalogue import checkpoint_folder
+
+    task_options = registry.find(command.task).options_from_text(command.option)
+    base = checkpoint_folder(command.policy, command.task)
+    chosen = {
+        field.name: getattr(command, field.name)
+        for field in fields(settings)
+        if hasattr(command, field.name)
+    }
+    show_run(
+        functools.partial(train, base, command.task, command.out),
+        command.out,
+        minutes=command.minutes,
+        steps=command.steps,
+        seed=command.seed,
+        settings=settings(**chosen),
+        options=task_options,
+        eval_every=command.eval_every,
+        eval_episodes=command.eval_episodes,
+        **options,
+    )
 
 
 def show_run(

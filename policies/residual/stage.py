@@ -113,8 +113,7 @@ class Stage(gymnasium.Env[Any, Any]):
         self._bounds = make.bounds
         spec = find(make.task).with_options(make.options)
         self._step_bounds = spec.step_bounds
-        # What has to be 0 in the end counts the goals that have not been reached.
-        self._counted = [metric.name for metric in spec.metrics if metric.bound == 0.0]
+        self._counted = spec.counts_goals
         self._place = make.place
         self._scene, self._played = make.place.episode, make.place.played
         self._is_over, self._is_another, self._is_reached = True, False, False

@@ -410,6 +410,14 @@ class Spec(Timing, Cameras, Disturbances):
         return min(bound for name, bound in self.step_bounds.items() if units[name] == "mm")
 
     @property
+    def counts_goals(self) -> tuple[str, ...]:
+        """Metrics that have to be 0 in the end, which count goals that were not reached; by name.
+
+        Empty where there is one goal.
+        """
+        return tuple(metric.name for metric in self.metrics if metric.bound == 0.0)
+
+    @property
     def fps(self) -> int:
         """Control steps a second, to the nearest whole number."""
         return round(1.0 / self.control_period_s)
