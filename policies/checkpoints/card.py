@@ -196,9 +196,11 @@ def _time(outcome: Mapping[str, Any], trained: Mapping[str, Any], was_fine_tuned
     """Hours of playing and learning; imitation counts its playing apart."""
     hours = (outcome["train_s"] + outcome.get("play_s", 0.0)) / 3600.0
     if was_fine_tuned:
-        learns = "environments" in trained["settings"]
-        players = trained["settings"]["environments"] if learns else trained["players"]
-        where = f"{_count(players, 'process', 'processes')} playing" + learns * " while one learns"
+        if "environments" in trained["settings"]:
+            players, meanwhile = trained["settings"]["environments"], " while one learns"
+        else:
+            players, meanwhile = trained["players"], ""
+        where = f"{_count(players, 'process', 'processes')} playing{meanwhile}"
         return f"{hours:.2f} h, {where}; evaluations not counted"
     learning = _count(trained["threads"], "thread", "threads")
     return f"{hours:.2f} h, learning on {learning}; recording not counted"

@@ -27,19 +27,18 @@ from hvs_suite.policies.belief.acting import CompiledBelief
 from hvs_suite.policies.belief.network import BeliefNetwork
 from hvs_suite.policies.catalogue import name_of
 from hvs_suite.policies.checkpoints.files import read_config
-from hvs_suite.policies.checkpoints.loading import check_fit, network_inputs, weights_digest
+from hvs_suite.policies.checkpoints.loading import network_inputs
 from hvs_suite.policies.residual.folding import load_base, with_choice, write_folded
-from hvs_suite.policies.residual.keeping import evaluate_and_keep, is_due
+from hvs_suite.policies.residual.session import begin, evaluate_and_keep, is_due
 from hvs_suite.policies.residual.way_settings import WaySettings
 from hvs_suite.policies.rl.evaluation import Evaluator, fallen, read_evaluations
-from hvs_suite.policies.rl.outcome import Outcome, Progress, check_run
+from hvs_suite.policies.rl.outcome import Outcome, Progress
 from hvs_suite.policies.rl.plot import draw_rl_run
 from hvs_suite.policies.training.budget import Budget
 from hvs_suite.policies.training.curves import Curves
-from hvs_suite.policies.training.process import prepare_process
 from hvs_suite.policies.training.run_folder import claimed, write_train_config
-from hvs_suite.registry import find, load, options_of
-from hvs_suite.rollout import carried, library_seeds, one_torch_thread
+from hvs_suite.registry import load
+from hvs_suite.rollout import carried, one_torch_thread
 
 if TYPE_CHECKING:
     from hvs_suite.tasks.shared.environment import Environment
@@ -64,7 +63,7 @@ def search(
     options: Mapping[str, Any] | None = None,
     split: str = "train",
     workers: Workers = 1,
-    eval_every: int = 20_000,
+    eval_every: int = 100_000,
     eval_episodes: int = 100,
     on_progress: Callable[[Progress], None] | None = None,
 ) -> Outcome:
@@ -97,17 +96,13 @@ def search(
         OutputError: ``out`` cannot be written, or holds something else than this run.
     """
     settings = settings or WaySettings()
-    spec = find(task).with_options(options or {})
-    options = options_of(spec)
     budget = Budget(steps, minutes)
-    check_run(seed, split, eval_every, eval_episodes)
-    check_fit(read_config(policy), policy, spec)
-    base = load_base(policy)
-    prepare_process()
-    identity = {
-        "base": weights_digest(policy), "task": task, "task_version": spec.version,
-        "options": options, "split": split, "seed": seed, **dataclasses.asdict(settings),
-    }  # fmt: skip
+    begun = begin(
+        policy, task, options,
+        split=split, seed=seed, eval_every=eval_every, eval_episodes=eval_episodes,
+    )  # fmt: skip
+    spec, options, base = begun.spec, begun.options, begun.base
+    identity = {**begun.identity, **dataclasses.asdict(settings)}
     training = out / "training"
     with contextlib.ExitStack() as stack:
         stack.enter_context(claimed(out, identity))
@@ -116,7 +111,6 @@ def search(
             out, identity, limits, PACKAGES, policy=name_of(policy), players=size(workers)
         )
         stack.enter_context(one_torch_thread())
-        stack.enter_context(library_seeds(seed))
         evaluator = stack.enter_context(contextlib.closing(Evaluator(spec, options, eval_episodes)))
         network = with_choice(base, settings.reach_m)
         assert network.choice is not None
@@ -134,7 +128,9 @@ def search(
             _tell(evolution, _asked(evolution, settings), generation["costs"])
         played = _total(generations, "env_steps")
         evaluations = read_evaluations(training / "evaluations.json", played)
-        curves = stack.enter_context(contextlib.closing(Curves(training / "tensorboard", played)))
+        curves = stack.enter_context(
+            contextlib.closing(Curves(training / "tensorboard", played + 1))
+        )
 
         def report(part: float | None = None, n: int = 0, further_s: float = 0.0) -> None:
             if on_progress is None:
@@ -365,7 +361,7 @@ def _outside(
         as many as it may take; and those that were played.
     """
     spec = env.spec
-    has_one_goal = all(metric.bound != 0.0 for metric in spec.metrics)
+    has_one_goal = not spec.counts_goals
     settled, most = math.inf, spec.time_limit_steps
     if has_one_goal:
         settled, most = min(SETTLED_STEPS, spec.hold_steps), min(most, patience_steps)

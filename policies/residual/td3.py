@@ -27,12 +27,10 @@ from hvs_suite.executor import worker_conditions
 from hvs_suite.files import replacing
 from hvs_suite.policies.belief.residual import N_LENGTHS, Residual
 from hvs_suite.policies.catalogue import name_of
-from hvs_suite.policies.checkpoints.files import read_config
-from hvs_suite.policies.checkpoints.loading import check_fit, weights_digest
 from hvs_suite.policies.residual.critics import Critics
-from hvs_suite.policies.residual.folding import load_base, with_residual, write_folded
-from hvs_suite.policies.residual.keeping import evaluate_and_keep, is_due
+from hvs_suite.policies.residual.folding import with_residual, write_folded
 from hvs_suite.policies.residual.replay import Replay
+from hvs_suite.policies.residual.session import begin, evaluate_and_keep, is_due
 from hvs_suite.policies.residual.settings import Settings
 from hvs_suite.policies.residual.stage import PRIVILEGED, READ, MakeStage, Place
 from hvs_suite.policies.residual.state import load_state, save_state
@@ -42,13 +40,11 @@ from hvs_suite.policies.rl.evaluation import (
     fallen,
     read_evaluations,
 )
-from hvs_suite.policies.rl.outcome import Outcome, Progress, check_run
+from hvs_suite.policies.rl.outcome import Outcome, Progress
 from hvs_suite.policies.rl.plot import draw_rl_run
 from hvs_suite.policies.training.budget import Budget
 from hvs_suite.policies.training.curves import Curves
-from hvs_suite.policies.training.process import prepare_process
 from hvs_suite.policies.training.run_folder import claimed, write_train_config
-from hvs_suite.registry import find, options_of
 from hvs_suite.rollout import library_seeds, one_torch_thread
 
 PACKAGES = ("gymnasium", "hvs-suite", "mujoco", "numpy", "torch")
@@ -105,18 +101,13 @@ def finetune(
         OutputError: ``out`` cannot be written, or holds something else than this run.
     """
     settings = settings or Settings()
-    spec = find(task).with_options(options or {})
-    options = options_of(spec)
     budget = Budget(steps, minutes)
-    check_run(seed, split, eval_every, eval_episodes)
-    check_fit(read_config(policy), policy, spec)
-    base = load_base(policy)
-    prepare_process()
-    identity = {
-        "base": weights_digest(policy), "task": task, "task_version": spec.version,
-        "options": options, "split": split, "seed": seed,
-        "curriculum": curriculum, **dataclasses.asdict(settings),
-    }  # fmt: skip
+    begun = begin(
+        policy, task, options,
+        split=split, seed=seed, eval_every=eval_every, eval_episodes=eval_episodes,
+    )  # fmt: skip
+    spec, options, base = begun.spec, begun.options, begun.base
+    identity = {**begun.identity, "curriculum": curriculum, **dataclasses.asdict(settings)}
     training = out / "training"
     with contextlib.ExitStack() as stack:
         stack.enter_context(claimed(out, identity))

@@ -1,4 +1,4 @@
-"""Settings of policy search on the way; the defaults are those of the weights that are shipped."""
+"""Settings of policy search on the way; the defaults are those of docs/experiments/the-way.md."""
 
 import dataclasses
 import math

@@ -238,6 +238,16 @@ def test_settings_that_make_no_sense_are_refused(setting):
         WaySettings(**setting)
 
 
+def test_the_command_makes_a_policy_and_draws_its_run(base, tmp_path, capsys):
+    words = ["--policy", str(base), "--task", TASK, "--out", str(tmp_path), "--workers", "1"]
+    small = ["--population", "4", "--scenes", "1", "--steps", "1", "--eval-episodes", "1"]
+    short = ["--option", "time_limit_steps=3", "--option", "hold_steps=3"]
+    assert run(["finetune-way", *words, *small, *short]) == 0
+    assert "12 environment steps" in capsys.readouterr().out
+    assert (tmp_path / "model.safetensors").exists()
+    assert (tmp_path / "training" / "training.png").stat().st_size > 10_000
+
+
 def test_what_cannot_be_fine_tuned_is_refused_in_a_line(chosen, base, tmp_path, capsys):
     with pytest.raises(PolicyError, match="fine-tuned already"):
         search(chosen, TASK, tmp_path / "twice", **CALL)
