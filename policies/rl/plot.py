@@ -45,8 +45,12 @@ GROUPS = (
             "train/value": "mean value",
             "train/residual": "residual, share of its bound",
             "train/ent_coef": "temperature",
-            "train/spread": "standard deviation of the candidates",
         },
+    ),
+    _Group(
+        "standard deviation of candidates",
+        "share of the largest shift",
+        {"train/spread": "standard deviation"},
     ),
 )
 
@@ -92,7 +96,8 @@ def draw_rl_run(training: Path, evaluations: Sequence[Evaluation]) -> Path:
         axes.set(ylabel=group.unit, title=group.title)
         if group.scale == PERCENT:
             axes.set(ylim=(0.0, 102.0))
-        axes.legend(frameon=False, fontsize=8)
+        if len(group.labels) > 1:
+            axes.legend(frameon=False, fontsize=8)
     for axes in (success, haste, *further):
         axes.set_xlabel("environment steps (thousands)")
         axes.grid(alpha=0.3)
