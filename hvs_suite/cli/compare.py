@@ -43,22 +43,27 @@ class Compare:
                 (f"by {found.b} alone", str(found.n_only_b)),
                 ("by neither", str(found.n_neither)),
                 ("p, exact McNemar", f"{found.p:.2g}"),
-                *_row("success, percentage points", found.success),
+                ("success, percentage points", _interval(found.success)),
                 *(
-                    row
+                    (f"{name} at the end", _tested(difference))
                     for name, difference in found.settled.items()
-                    for row in _row(f"{name} at the end", difference)
                 ),
-                *_row("steps to goal, where both succeed", found.steps_to_goal),
+                *(
+                    [("steps to goal, where both succeed", _tested(found.steps_to_goal))]
+                    if found.steps_to_goal
+                    else []
+                ),
             ],
-            title=f"A = {found.a}, B = {found.b}; differences are A minus B with 95 % intervals",
+            title=f"A = {found.a}, B = {found.b}; differences are A minus B with 95 % "
+            "intervals and p of Wilcoxon's signed-rank test",
         )
         print(shown(found.conclusion()))
         return 0
 
 
-def _row(name: str, difference: "Difference | None") -> list[tuple[str, str]]:
-    if difference is None:
-        return []
-    d = difference
-    return [(name, f"{d.estimate:+.3g} ({d.low:+.3g} to {d.high:+.3g})")]
+def _interval(difference: "Difference") -> str:
+    return f"{difference.estimate:+.3g} ({difference.low:+.3g} to {difference.high:+.3g})"
+
+
+def _tested(difference: "Difference") -> str:
+    return f"{_interval(difference)}, p = {difference.p:.2g}"

@@ -139,6 +139,18 @@ def test_a_paired_difference_cancels_what_scenarios_have_in_common() -> None:
     assert noisy.low <= noisy.estimate <= noisy.high
 
 
+def test_a_paired_difference_is_tested_by_the_ranks_of_what_differs() -> None:
+    random = np.random.default_rng(7)
+    hard = random.normal(scale=100.0, size=200)
+    sooner = hard - random.exponential(size=200)
+    assert paired_difference(sooner, hard).p < 1e-9
+    either = random.normal(size=100)
+    assert paired_difference(hard + np.concatenate([either, -either]), hard).p > 0.9
+    assert paired_difference(hard, hard).p == 1.0
+    # Five pairs that all differ to one side: 2 of the 2^5 ways in which their signs could fall.
+    assert paired_difference([1.0, 2.0, 3.0, 4.0, 5.0], np.zeros(5)).p == pytest.approx(0.0625)
+
+
 def test_pairs_need_equal_lengths() -> None:
     with pytest.raises(ValueError, match="equal lengths"):
         paired_difference([1.0], [1.0, 2.0])
