@@ -75,6 +75,19 @@ def demonstrator_factory(
     return make
 
 
+def shipped_folder(kind: str, task: str) -> Path:
+    """Where the weights are that ship for a task, if any do.
+
+    Imitated weights also serve tasks that ask nothing else. Fine-tuned ones serve the task alone on
+    which they are shown to be better than these.
+
+    Args:
+        kind: ``pretrained`` or ``finetuned``.
+        task: Named task.
+    """
+    return HERE / kind / (trained_on(task) if kind == "pretrained" else task)
+
+
 def checkpoint_folder(spec: str, task: str) -> Path:
     """Find a checkpoint for a task.
 
@@ -86,7 +99,7 @@ def checkpoint_folder(spec: str, task: str) -> Path:
         PolicyError: There is no such checkpoint.
     """
     if spec in SHIPPED:
-        folder = HERE / spec / trained_on(task)
+        folder = shipped_folder(spec, task)
         if not folder.is_dir():
             command = "hvs pretrain" if spec == "pretrained" else "hvs finetune"
             raise PolicyError(

@@ -81,7 +81,8 @@ def recipe(task: str) -> Recipe:
         json.loads((folder / f"{name}.json").read_text())
         for folder in (DATASET_RECIPES, HERE / "recipes")
     )
-    finetune = learned.get("finetune")
+    # Fine-tuned weights ship for the task alone on which they are better.
+    finetune = learned.get("finetune") if task == name else None
     return Recipe(
         name,
         record=_words(recorded["command"]),

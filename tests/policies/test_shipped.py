@@ -6,18 +6,18 @@ import pytest
 import scipy.stats
 
 import hvs_suite
+from hvs_suite.errors import PolicyError
 from hvs_suite.eval.scoring import provenance, result_file
 from hvs_suite.policies import catalogue
-from hvs_suite.policies.recipe import trained_on
+from hvs_suite.policies.recipe import recipe
 from hvs_suite.rollout import rollout
 
-ROOM = Path(catalogue.HERE)
 RESULTS = Path(__file__).parents[2] / "eval" / "results"
 SHIPPED = [
     (kind, task)
     for kind in catalogue.SHIPPED
     for task in hvs_suite.TASKS
-    if (ROOM / kind / trained_on(task)).is_dir()
+    if catalogue.shipped_folder(kind, task).is_dir()
 ]
 
 
@@ -49,9 +49,20 @@ def test_shipped_weights_solve_scenes_that_nobody_trained_on(kind, task, few, mo
 
 @pytest.mark.parametrize(("kind", "task"), SHIPPED)
 def test_the_board_and_the_card_speak_of_these_weights(kind, task):
-    folder = ROOM / kind / trained_on(task)
+    folder = catalogue.shipped_folder(kind, task)
     result = result_file.load(RESULTS / kind / f"{task}.json")
     assert result.metadata.policy_hash == provenance.checkpoint_hash(folder)
     summary = result.summary
     row = f"| `{task}` | `test` | {summary.n_success:,} of {summary.n_episodes:,}"
     assert row in (folder / "README.md").read_text()
+
+
+def test_fine_tuned_weights_serve_the_task_alone_on_which_they_are_better():
+    imitated, tuned = (catalogue.shipped_folder(kind, "track-line") for kind in catalogue.SHIPPED)
+    assert imitated == catalogue.shipped_folder("pretrained", "track-curve")
+    assert catalogue.shipped_folder("finetuned", "track-curve").is_dir()
+    assert not tuned.is_dir()
+    with pytest.raises(PolicyError, match="no finetuned weights for track-line"):
+        catalogue.policy_factory("finetuned", "track-line")
+    assert recipe("track-curve").finetune
+    assert recipe("track-line").finetune is None
