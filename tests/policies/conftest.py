@@ -1,4 +1,4 @@
-"""What the tests of policies share: a small dataset and a checkpoint trained on it."""
+"""What the tests of policies share: a small dataset, and policies, one trained on it and one not."""
 
 from pathlib import Path
 
@@ -30,3 +30,15 @@ def checkpoint(large_dataset: Path, tmp_path_factory: pytest.TempPathFactory) ->
     out = tmp_path_factory.mktemp("checkpoint")
     pretrain(large_dataset, out, steps=2, batch_size=4, windows=4, window_steps=4)
     return out
+
+
+@pytest.fixture(scope="module")
+def base(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A policy that nobody has trained, for the task that the test's module names as `TASK`."""
+    from test_hvs_policy import new_policy
+
+    from hvs_suite.policies.hvs.modeling_hvs import save_checkpoint
+
+    folder = tmp_path_factory.mktemp("base")
+    save_checkpoint(new_policy(request.module.TASK), folder)
+    return folder

@@ -56,16 +56,6 @@ class Killed(BaseException):
 
 
 @pytest.fixture(scope="module")
-def base(tmp_path_factory):
-    """A policy that nobody has trained, of the family."""
-    from hvs_suite.policies.hvs.modeling_hvs import save_checkpoint
-
-    folder = tmp_path_factory.mktemp("base")
-    save_checkpoint(new_policy(TASK), folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def moved(base, tmp_path_factory):
     """The same with a residual that has learned something."""
     network = with_residual(load_base(base), SMALL)

@@ -30,16 +30,6 @@ CALL = {"settings": SMALL, "eval_episodes": 1, "eval_every": 1000, "steps": 100}
 
 
 @pytest.fixture(scope="module")
-def base(tmp_path_factory):
-    """A policy that nobody has trained."""
-    from hvs_suite.policies.hvs.modeling_hvs import save_checkpoint
-
-    folder = tmp_path_factory.mktemp("base")
-    save_checkpoint(new_policy(TASK), folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def chosen(base, tmp_path_factory):
     """The same with a choice that has learned something."""
     network = with_choice(load_base(base), 0.001)
