@@ -48,7 +48,7 @@ GROUPS = (
         },
     ),
     _Group(
-        "standard deviation of candidates",
+        "spread of the candidates",
         "share of the largest shift",
         {"train/spread": "standard deviation"},
     ),

@@ -1,4 +1,4 @@
-"""What the tests of policies share: a small dataset, and policies, one trained on it and one not."""
+"""What the tests of policies share: a small dataset, a policy trained on it, and one untrained."""
 
 from pathlib import Path
 
